@@ -1,0 +1,223 @@
+"""478 face landmarks and 52 blendshape scores per frame, with Google's Face Landmarker networks.
+
+Pixel centres are at integers throughout. The network's own coordinates put them at halves (a mirror test shows
+a shift of half a crop pixel); sampling the crop at its pixels' centres and reading the output in units of the
+crop's width, edge to edge, leaves none.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib.resources import files
+
+import cv2
+import numpy as np
+from ai_edge_litert.interpreter import Interpreter
+from numpy.typing import NDArray
+
+from tracker.face_detector import Face, FaceDetector
+from tracker.landmark_indices import (
+    BLENDSHAPE_INPUT,
+    BLENDSHAPE_NAMES,
+    LEFT_EYE_OUTER,
+    POINTS,
+    RIGHT_EYE_OUTER,
+)
+from tracker.track import F32, Landmarks
+
+INPUT_SIZE = 256  # px, side of the landmark network's square input
+MARGIN = 1.5  # side of the region over the long side of the face's box
+MIN_PRESENCE = 0.5  # below, the face counts as lost
+SEARCH_INTERVAL = 10  # frames between searches in tiles while no face is found: each is dozens of detections
+# Share of the new frame's region in the smoothed one. The points follow the face within the region, so that a
+# region that lags costs nothing, while one that jumps adds jitter.
+SMOOTHING = 0.35
+
+
+@dataclass(frozen=True)
+class Roi:
+    """A rotated square in the picture: centre x, y px, side px, angle rad (x to y)."""
+
+    x: float
+    y: float
+    side: float
+    angle: float
+
+    def to_picture(self) -> NDArray[np.float64]:
+        """[2, 3] affine map from the unit square (0..1, edge to edge) to picture pixels."""
+        cos, sin = self.side * np.cos(self.angle), self.side * np.sin(self.angle)
+        linear = np.array([[cos, -sin], [sin, cos]])
+        offset = np.array([self.x, self.y]) - linear @ (0.5, 0.5)
+        return np.column_stack([linear, offset])
+
+    def blend(self, other: Roi, share: float) -> Roi:
+        """This region moved towards `other` by `share` (0..1) of the way."""
+        turn = (other.angle - self.angle + np.pi) % (2 * np.pi) - np.pi
+        return Roi(
+            self.x + share * (other.x - self.x),
+            self.y + share * (other.y - self.y),
+            self.side + share * (other.side - self.side),
+            self.angle + share * turn,
+        )
+
+
+def roi_from_face(face: Face) -> Roi:
+    """The region of a detection: its box's long side x MARGIN, level with the eyes."""
+    (left, top, right, bottom), (right_eye, left_eye) = face.box, face.keypoints[:2]
+    return _roi((left, top), (right, bottom), left_eye - right_eye)
+
+
+def roi_from_points(points: F32) -> Roi:
+    """The region around landmarks [478, 2 or 3] px: their box's long side x MARGIN, level with the eyes."""
+    xy = points[:, :2]
+    return _roi(xy.min(0), xy.max(0), xy[LEFT_EYE_OUTER] - xy[RIGHT_EYE_OUTER])
+
+
+def _roi(low: Iterable[float], high: Iterable[float], eyes: F32) -> Roi:
+    (left, top), (right, bottom) = low, high
+    side = MARGIN * max(right - left, bottom - top, 1.0)
+    return Roi(
+        float(left + right) / 2, float(top + bottom) / 2, float(side), float(np.arctan2(eyes[1], eyes[0]))
+    )
+
+
+def crop(rgb: NDArray[np.uint8], roi: Roi) -> NDArray[np.uint8]:
+    """The region of rgb [H, W, 3] as [INPUT_SIZE, INPUT_SIZE, 3], the picture's border repeated outside."""
+    to_picture = roi.to_picture()
+    # Pixel i of the crop is centred at (i + 0.5) / INPUT_SIZE of the unit square.
+    linear = to_picture[:, :2] / INPUT_SIZE
+    offset = to_picture[:, 2] + linear @ (0.5, 0.5)
+    return cv2.warpAffine(
+        rgb,
+        np.column_stack([linear, offset]),
+        (INPUT_SIZE, INPUT_SIZE),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+
+
+class FaceLandmarker:
+    """The three networks of the embedded Face Landmarker; not for use by several threads at once."""
+
+    def __init__(self, threads: int = 1) -> None:
+        """threads: of each network; more than one does not pay on two cores (benchmarks/landmarks.py)."""
+        with files("tracker").joinpath("assets/face_landmarker.task").open("rb") as file:
+            archive = zipfile.ZipFile(file)
+            self._detector = FaceDetector(archive.read("face_detector.tflite"), threads)
+            landmarks = archive.read("face_landmarks_detector.tflite")
+            blendshapes = archive.read("face_blendshapes.tflite")
+        self._landmarks = _Network(landmarks, threads)
+        self._blendshapes = _Network(blendshapes, threads)
+
+    def detect(self, rgb: NDArray[np.uint8], tiled: bool = False) -> list[Face]:
+        """Faces in rgb [H, W, 3] u8, best score first; `tiled`: if the whole shows none, search tiles."""
+        return self._detector.detect(rgb, tiled)
+
+    def landmarks(self, rgb: NDArray[np.uint8], roi: Roi) -> tuple[F32, float, F32]:
+        """Landmarks of the face in one region of rgb [H, W, 3] u8.
+
+        Returns points [478, 3] (x, y in picture pixels, z in the same scale), presence 0..1, blendshapes [52]
+        in the order of BLENDSHAPE_NAMES, 0..1. They are meaningless when presence is low.
+        """
+        # The rest of the outputs is a flag for a tongue, which the 52 scores do without.
+        raw, presence_logit, _ = self._landmarks(crop(rgb, roi).astype(np.float32)[None] / 255.0)
+        unit = raw.reshape(POINTS, 3) / INPUT_SIZE
+        to_picture = roi.to_picture()
+        xy = unit[:, :2] @ to_picture[:, :2].T + to_picture[:, 2]
+        points = np.column_stack([xy, unit[:, 2] * roi.side]).astype(np.float32)
+        (scores,) = self._blendshapes(points[None, BLENDSHAPE_INPUT, :2])
+        presence = 1.0 / (1.0 + np.exp(-float(presence_logit.reshape(()))))
+        return points, presence, scores.reshape(52)
+
+
+class _Network:
+    """A .tflite network with one input, its outputs in the order of their names."""
+
+    def __init__(self, content: bytes, threads: int) -> None:
+        self._interpreter = Interpreter(model_content=content, num_threads=threads)
+        self._interpreter.allocate_tensors()
+        self._input = self._interpreter.get_input_details()[0]["index"]
+        outputs = sorted(self._interpreter.get_output_details(), key=lambda d: str(d["name"]))
+        self._outputs = [d["index"] for d in outputs]
+
+    def __call__(self, values: F32) -> list[F32]:
+        self._interpreter.set_tensor(self._input, values)
+        self._interpreter.invoke()
+        return [self._interpreter.get_tensor(i) for i in self._outputs]
+
+
+class LandmarkTracker:
+    """Follows the largest face: the landmarks of one frame give the region of the next."""
+
+    def __init__(self, landmarker: FaceLandmarker) -> None:
+        self._landmarker = landmarker
+        self._roi: Roi | None = None
+        self._frames_without = 0
+
+    def reset(self) -> None:
+        """Forgets the face: the next frame begins another shot."""
+        self._roi = None
+        self._frames_without = 0
+
+    def next(self, rgb: NDArray[np.uint8]) -> tuple[F32, float, F32] | None:
+        """Landmarks, presence and blendshapes (as `FaceLandmarker.landmarks`) of the next frame, or None."""
+        if self._roi is not None:
+            found = self._landmarker.landmarks(rgb, self._roi)
+            if found[1] >= MIN_PRESENCE:
+                self._roi = self._roi.blend(roi_from_points(found[0]), SMOOTHING)
+                return found
+        return self._search(rgb)
+
+    def _search(self, rgb: NDArray[np.uint8]) -> tuple[F32, float, F32] | None:
+        self._roi = None
+        faces = self._landmarker.detect(rgb, tiled=self._frames_without % SEARCH_INTERVAL == 0)
+        self._frames_without += 1
+        for face in sorted(faces, key=lambda f: f.box[0] - f.box[2]):
+            points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
+            if presence < MIN_PRESENCE:
+                continue
+            # Once more in the region that the following frames will have: a detection's is another size.
+            roi = roi_from_points(points)
+            found = self._landmarker.landmarks(rgb, roi)
+            if found[1] >= MIN_PRESENCE:
+                self._roi, self._frames_without = roi_from_points(found[0]), 0
+                return found
+        return None
+
+
+def track_landmarks(
+    frames: Iterable[tuple[float, NDArray[np.uint8]]],
+    total: int,
+    cuts: set[int] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Landmarks:
+    """Landmarks of a whole clip.
+
+    frames: (time s, rgb [H, W, 3] u8) in order, all of one size, at least one. total: their number (for progress).
+    cuts: indices of frames that begin another shot, where nothing is taken over from the frame before.
+    """
+    tracker = LandmarkTracker(FaceLandmarker())
+    times: list[float] = []
+    rows: list[tuple[F32, float, F32]] = []
+    nothing = (np.full((POINTS, 3), np.nan, np.float32), 0.0, np.zeros(52, np.float32))
+    size = (0, 0)
+    for index, (time, rgb) in enumerate(frames):
+        if cuts is not None and index in cuts:
+            tracker.reset()
+        times.append(time)
+        rows.append(tracker.next(rgb) or nothing)
+        size = (rgb.shape[1], rgb.shape[0])
+        if progress is not None:
+            progress(index + 1, total)
+    assert rows, "a clip without frames"
+    points, presence, blendshapes = zip(*rows)
+    return Landmarks(
+        time=np.array(times, np.float64),
+        points=np.stack(points),
+        presence=np.array(presence, np.float32),
+        blendshapes=np.stack(blendshapes),
+        blendshape_names=BLENDSHAPE_NAMES,
+        size=size,
+    )
