@@ -1,0 +1,82 @@
+"""The `personalize` command: finds the subcommand, turns errors into exit codes."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from typing import Annotated
+
+# Threads are set on purpose, per stage: left alone, OpenMP and BLAS both take every core and wait for each other.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import typer
+
+from cli.animate import animate
+from cli.demo import demo
+from cli.run import run
+from personalize.errors import UserError
+from personalize.run import tool_version
+
+COMMANDS = {"run": run, "animate": animate, "demo": demo}
+INPUT_ERROR, BUG, INTERRUPTED = 2, 1, 130
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    help="Turn a talking-head video into a personal, editable 3D facial animation model.",
+    epilog="""Examples:  personalize talk.mp4   |   personalize animate speech.wav --subject talk.personalize   |
+    personalize demo.   A video whose name is a command's is given as ./name.""",
+)
+for name, command in COMMANDS.items():
+    app.command(name)(command)
+
+
+def _print_version(value: bool) -> None:
+    if value:
+        typer.echo(f"personalize {tool_version()}")
+        raise typer.Exit()
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options that stand before any command."""
+
+
+def with_default_command(arguments: list[str]) -> list[str]:
+    """`personalize VIDEO …` is `personalize run VIDEO …`."""
+    if not arguments or arguments[0] in COMMANDS or arguments[0] in ("--help", "--version"):
+        return arguments
+    return ["run", *arguments]
+
+
+def main() -> None:
+    """Entry point. Exit codes: 0 done, 2 the user's input, 130 interrupted, 1 a bug."""
+    arguments = with_default_command(sys.argv[1:]) or ["--help"]
+    try:
+        code = app(arguments, standalone_mode=False)
+    except UserError as error:
+        typer.echo(f"personalize: {error}", err=True)
+        code = INPUT_ERROR
+    except (KeyboardInterrupt, typer.Abort):
+        typer.echo("personalize: interrupted; run the same command again to continue", err=True)
+        code = INTERRUPTED
+    except Exception as error:
+        # Typer's own complaints about options carry an exit code; anything else is a bug of ours.
+        if hasattr(error, "format_message"):
+            typer.echo(f"personalize: {error.format_message()} (see --help)", err=True)
+            code = INPUT_ERROR
+        else:
+            traceback.print_exc()
+            typer.echo("personalize: this is a bug; please report it with the lines above and log.txt", err=True)
+            code = BUG
+    sys.exit(code or 0)
+
+
+if __name__ == "__main__":
+    main()

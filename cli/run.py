@@ -1,0 +1,37 @@
+"""`personalize VIDEO`: from a video to a subject's checkpoint, an overlay to check, and a report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from personalize.settings import Settings
+
+
+def run(
+    video: Annotated[Path, typer.Argument(help="Video of one person talking: anything FFmpeg reads.")],
+    out: Annotated[Path | None, typer.Option(help="Run folder; VIDEO's name + .personalize if not given.")] = None,
+    iterations: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = Settings.iterations,
+    seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = Settings.seed,
+    focal: Annotated[float | None, typer.Option(min=1, help="Focal length in pixels, if known.")] = None,
+    guidance: Annotated[
+        float | None, typer.Option(min=0, max=2, help="Guidance scale; chosen on validation if not given.")
+    ] = None,
+    until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
+    from_: Annotated[str | None, typer.Option("--from", metavar="STAGE", help="Make again from here on.")] = None,
+    force: Annotated[str | None, typer.Option(metavar="STAGE", help="Make this stage again.")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Track the face in VIDEO, fine-tune the model on it, and report. Run it again to continue or to change."""
+    from personalize.pipeline import personalize_video
+
+    settings = Settings(iterations=iterations, seed=seed, focal_px=focal, guidance=guidance)
+    result = personalize_video(video, out, settings, first=from_, until=until, force=force)
+    if json_:
+        typer.echo(json.dumps({name: str(path) for name, path in result.items()}))
+    else:
+        for name, path in result.items():
+            typer.echo(f"{name:<11} {path}")

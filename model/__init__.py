@@ -1,0 +1,1 @@
+"""Motion + speech -> checkpoint -> Motion: network, diffusion, trainer, speech encoder, metrics."""

@@ -1,0 +1,1 @@
+"""The staged pipeline, and everything that joins tracker and model."""

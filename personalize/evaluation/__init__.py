@@ -1,0 +1,1 @@
+"""How good the checkpoint is: systems, metrics, the report."""

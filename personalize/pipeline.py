@@ -1,0 +1,72 @@
+"""The ordered list of stages: reading it is understanding the product."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from model.checkpoint import CheckpointError
+from model.motion import MotionError
+from personalize.errors import UserError
+from personalize.media import probe
+from personalize.reporter import Reporter
+from personalize.run import RunFolder
+from personalize.settings import Settings
+from personalize.stage import Context, Stage, run_stages
+from personalize.stages import (
+    CameraStage,
+    Evaluate,
+    Finetune,
+    Ingest,
+    LandmarkStage,
+    Overlay,
+    Refine,
+    Registration,
+    TrackStage,
+)
+from tracker.track import TrackError
+
+STAGES: tuple[Stage, ...] = (
+    Ingest(),  # video -> times, usable frames, sound, split
+    LandmarkStage(),  # 478 points and 52 scores a frame
+    CameraStage(),  # focal length and rigid head poses
+    TrackStage(),  # identity, expression, pose: jointly over the clip
+    Refine(),  # photometric refinement
+    Overlay(),  # overlay.mp4, to check by eye
+    Registration(),  # Track -> Motion at 30 fps
+    Finetune(),  # Motion + speech -> checkpoint.safetensors
+    Evaluate(),  # metrics, a clip beside the reference, report.html
+)
+PRODUCTS = ("checkpoint.safetensors", "overlay.mp4", "report.html")
+
+
+def personalize_video(
+    video: Path,
+    out: Path | None,
+    settings: Settings,
+    *,
+    first: str | None = None,
+    until: str | None = None,
+    force: str | None = None,
+    report: Reporter | None = None,
+) -> dict[str, Path]:
+    """Bring the run folder of `video` up to date; returns its products by name.
+
+    out: the run folder, by default the video's name + `.personalize` in the working folder.
+    Raises UserError for whatever the user can mend.
+    """
+    probe(video)
+    folder = out or Path(f"{video.stem}.personalize")
+    report = report or Reporter()
+    # Asked before the lock so that a folder which is not ours is left as it is, and again once nobody else writes.
+    run = RunFolder.create(folder, video)
+    with run.locked():
+        run = RunFolder.create(folder, video)
+        report.log_to(folder / "log.txt")
+        run.begin(settings)
+        try:
+            run_stages(STAGES, Context(run, settings, report), first=first, until=until, force=force)
+        except (TrackError, CheckpointError, MotionError) as error:
+            raise UserError(f"{video}: {error}") from error
+    return {"run": folder} | {
+        Path(name).stem: folder / name for name in PRODUCTS if (folder / name).is_file()
+    }

@@ -1,0 +1,21 @@
+"""Everything a user can set on a run. Each stage names the fields it reads; they are part of its key."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Options of `personalize VIDEO`; the defaults are the recommended ones.
+
+    iterations: fine-tuning steps (the paper: 30 000).
+    seed: seed of every random draw.
+    focal_px: focal length in pixels, None to estimate it.
+    guidance: guidance scale stored in the checkpoint, None to choose it on the validation split.
+    """
+
+    iterations: int = 30_000
+    seed: int = 0
+    focal_px: float | None = None
+    guidance: float | None = None

@@ -1,0 +1,158 @@
+"""Stages: cached by content, remade when anything that decides them changes, whole or not there."""
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+
+from personalize.errors import UserError
+from personalize.reporter import Reporter
+from personalize.run import RunFolder
+from personalize.settings import Settings
+from personalize.stage import Context, Stage, is_cached, run_stages
+
+
+class Count(Stage):
+    """Writes how many bytes the video has; `slow` may be killed in the middle."""
+
+    name, version, reads, needs, makes = "count", 1, ("seed",), ("video",), ("count.txt",)
+    made: ClassVar[int] = 0
+
+    def make(self, context: Context, folder: Path) -> None:
+        type(self).made += 1
+        (folder / "count.txt").write_text(f"{context.run.video.stat().st_size} {context.settings.seed}")
+
+
+class Double(Stage):
+    """Twice the count, as a product at the top."""
+
+    name, version, needs, makes, products = "double", 1, ("count/count.txt",), ("half.txt",), ("double.txt",)
+    made: ClassVar[int] = 0
+
+    def make(self, context: Context, folder: Path) -> None:
+        type(self).made += 1
+        count = int((context.run.path / "count/count.txt").read_text().split()[0])
+        (folder / "half.txt").write_text(str(count // 2))
+        (folder / "double.txt").write_text(str(2 * count))
+
+
+class Crawl(Stage):
+    """Counts to ten in its partial folder and continues from there."""
+
+    name, version, makes, resumes = "crawl", 1, ("steps.txt",), True
+
+    def make(self, context: Context, folder: Path) -> None:
+        log = folder / "steps.txt"
+        for step in range(len(log.read_text().split()) if log.exists() else 0, 10):
+            with log.open("a") as stream:
+                stream.write(f"{step}@{os.getpid()} ")
+            time.sleep(0.05)
+
+
+@pytest.fixture
+def context(tmp_path: Path) -> Context:
+    video = tmp_path / "talk.mp4"
+    video.write_bytes(b"twelve bytes")
+    run = RunFolder.create(tmp_path / "run", video)
+    run.path.mkdir()
+    run.begin(Settings())
+    Count.made = Double.made = 0
+    return Context(run, Settings(), Reporter(stream=(tmp_path / "said.txt").open("w")))
+
+
+STAGES = (Count(), Double())
+
+
+def test_second_run_makes_nothing(context: Context) -> None:
+    run_stages(STAGES, context)
+    again = Context(RunFolder.open(context.run.path), context.settings, context.report)
+    run_stages(STAGES, again)
+    assert (Count.made, Double.made) == (1, 1)
+    assert (context.run.path / "double.txt").read_text() == "24"
+    entry = json.loads((context.run.path / "run.json").read_text())["stages"]["double"]
+    assert set(entry["outputs"]) == {"double/half.txt", "double.txt"}
+
+
+def test_a_setting_remakes_only_what_changes(context: Context) -> None:
+    run_stages(STAGES, context)
+    run_stages(STAGES, Context(context.run, Settings(iterations=5), context.report))
+    assert (Count.made, Double.made) == (1, 1)
+    run_stages(STAGES, Context(context.run, Settings(seed=1), context.report))
+    assert (Count.made, Double.made) == (2, 2)
+
+
+@pytest.mark.parametrize("damaged", ["count/count.txt", "double.txt"])
+def test_a_damaged_output_is_made_again(context: Context, damaged: str) -> None:
+    run_stages(STAGES, context)
+    (context.run.path / damaged).write_text("damaged")
+    run_stages(STAGES, context)
+    assert (context.run.path / "count/count.txt").read_text() == "12 0"
+    assert (context.run.path / "double.txt").read_text() == "24"
+
+
+def test_until_from_and_force(context: Context) -> None:
+    run_stages(STAGES, context, until="count")
+    assert (Count.made, Double.made) == (1, 0)
+    run_stages(STAGES, context)
+    run_stages(STAGES, context, force="count")
+    assert (Count.made, Double.made) == (2, 1), "the same bytes came out: what follows stays"
+    run_stages(STAGES, context, first="count")
+    assert (Count.made, Double.made) == (3, 2)
+    with pytest.raises(UserError, match="no such stage; choose one of count, double"):
+        run_stages(STAGES, context, until="counts")
+
+
+def test_a_failing_stage_leaves_the_earlier_result(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_stages(STAGES, context)
+
+    def fail(self: Stage, context: Context, folder: Path) -> None:
+        (folder / "count.txt").write_text("half")
+        raise UserError("no")
+
+    monkeypatch.setattr(Count, "make", fail)
+    with pytest.raises(UserError):
+        run_stages(STAGES, context, force="count")
+    assert (context.run.path / "count/count.txt").read_text() == "12 0"
+    assert is_cached(STAGES[0], STAGES[0].key(context), context.run)
+
+
+def _crawl(path: Path) -> None:
+    run = RunFolder.open(path)
+    run_stages((Crawl(),), Context(run, Settings(), Reporter(stream=open(os.devnull, "w"))))
+
+
+def test_killed_stage_is_not_taken_for_finished_and_continues(context: Context) -> None:
+    process = multiprocessing.get_context("fork").Process(target=_crawl, args=(context.run.path,))
+    process.start()
+    partial = context.run.path / ".crawl.partial/steps.txt"
+    while not partial.exists() or len(partial.read_text().split()) < 3:
+        time.sleep(0.01)
+    os.kill(process.pid or 0, signal.SIGKILL)
+    process.join()
+    assert not (context.run.path / "crawl").exists()
+    _crawl(context.run.path)
+    steps = (context.run.path / "crawl/steps.txt").read_text().split()
+    assert [int(step.split("@")[0]) for step in steps] == list(range(10))
+    assert len({step.split("@")[1] for step in steps}) == 2
+
+
+def test_another_process_is_refused(context: Context) -> None:
+    with context.run.locked(), pytest.raises(UserError, match="another personalize is working there"):
+        with RunFolder.open(context.run.path).locked():
+            pass
+
+
+def test_another_videos_folder_is_refused(context: Context, tmp_path: Path) -> None:
+    other = tmp_path / "other.mp4"
+    other.write_bytes(b"other")
+    before = (context.run.path / "run.json").read_bytes()
+    with pytest.raises(UserError, match=r"another video \(talk.mp4\)"):
+        RunFolder.create(context.run.path, other)
+    assert (context.run.path / "run.json").read_bytes() == before
+    with pytest.raises(UserError, match="not a run folder"):
+        RunFolder.create(tmp_path, other)

@@ -1,0 +1,1 @@
+"""Video frames -> Track: landmarks, head model, camera, fit, overlay."""
