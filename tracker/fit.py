@@ -1,0 +1,223 @@
+"""Fit the head to a clip's landmarks: one identity from key frames, then every frame, smooth in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracker.confidence import confidence
+from tracker.energy import (
+    POSE,
+    Energy,
+    LandmarkModel,
+    Weights,
+    landmark_model,
+    rotation_axis_angle,
+    rotation_matrix,
+    rotation_vector,
+    visibility,
+)
+from tracker.gaze import eye_rotations
+from tracker.solver import Smoothness, solve_frames, solve_subject
+from tracker.track import F64, Bundle, Camera, Landmarks, Track, TrackError
+
+if TYPE_CHECKING:
+    from tracker.head import HeadModel
+
+KEY_FRAMES = 48
+MIN_PRESENCE = 0.5
+REST_SHARE = 0.5  # of the key frames: frames at rest, which tell the neutral face
+
+Frames = NDArray[np.int64]
+
+
+def fit_track(
+    landmarks: Landmarks,
+    camera: Camera,
+    bundle: Bundle,
+    head: HeadModel,
+    usable: NDArray[np.bool_],
+    segment: NDArray[np.int32],
+    progress: Callable[[int, int], None] | None = None,
+    weights: Weights | None = None,
+) -> Track:
+    """The head's identity, and expression, pose and gaze in every frame, under the given camera.
+
+    usable: [T] bool, frames that may be measured. segment: [T], number of the uninterrupted shot; smoothness never
+    crosses from one to another. Raises TrackError when no frame can be measured.
+    """
+    weights = weights or Weights()
+    model = landmark_model(head, weights)
+    good = _measurable(landmarks, model, usable)
+    observed = _undistorted(landmarks.points[good][..., :2], camera)
+    energy, start = _start(model, weights, camera, observed, landmarks.points[good])
+    keys = key_frames(observed, energy.px_per_m)
+    identity = fit_identity(energy, start, keys)
+    x = fit_frames(energy, start, identity, landmarks.time[good], _runs(good, segment), progress)
+    return _track(landmarks, camera, head, energy, observed, identity, x, good)
+
+
+def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.bool_]) -> Frames:
+    finite = np.isfinite(landmarks.points[:, model.landmarks]).all(axis=(1, 2))
+    good = np.flatnonzero(usable & finite & (landmarks.presence >= MIN_PRESENCE))
+    if not len(good):
+        raise TrackError(
+            f"no face to fit: of {len(usable)} frames {int(usable.sum())} are usable and none shows a face clearly; "
+            "give a clip in which one face is seen from the front"
+        )
+    return good
+
+
+def _undistorted(points: NDArray[np.floating], camera: Camera) -> F64:
+    """[n, 478, 2] px as a camera without distortion would see them."""
+    flat = points.astype(np.float64)
+    if not len(camera.distortion):
+        return flat
+    k1, k2, k3 = (*camera.distortion, 0.0, 0.0)[:3]
+    (cx, cy), f = camera.principal_px, camera.focal_px
+    matrix = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]])
+    lens = np.array([k1, k2, 0.0, 0.0, k3])
+    return cv2.undistortPoints(flat.reshape(-1, 1, 2), matrix, lens, P=matrix).reshape(flat.shape)
+
+
+def _start(
+    model: LandmarkModel, weights: Weights, camera: Camera, observed: F64, points: NDArray[np.floating]
+) -> tuple[Energy, F64]:
+    """The energy of the clip, and poses of the mean head: orthogonal Procrustes against the landmarker's own depth."""
+    seen = points[:, model.landmarks].astype(np.float64)
+    centre = seen.mean(1, keepdims=True)
+    covariance = (seen - centre).transpose(0, 2, 1) @ model.mean
+    u, size, vt = np.linalg.svd(covariance)
+    sign = np.ones((len(seen), 3))
+    sign[:, 2] = np.linalg.det(u @ vt)
+    matrix = (u * sign[:, None]) @ vt
+    px_per_m = (size * sign).sum(1) / (model.mean**2).sum()
+    principal = np.array(camera.principal_px, np.float64)
+    ray = np.concatenate([centre[:, 0, :2] - principal, np.full((len(seen), 1), camera.focal_px)], axis=1)
+    translation = ray / px_per_m[:, None]
+    rotation = rotation_vector(matrix)
+    x = np.concatenate([np.zeros((len(seen), model.expressions)), rotation, translation], axis=1)
+    energy = Energy(
+        model=model,
+        weights=weights,
+        focal=camera.focal_px,
+        principal=principal,
+        observed=observed[:, model.landmarks],
+        px_per_m=px_per_m,
+        visible=visibility(model, rotation, translation),
+        strictness=np.ones(len(seen)),
+    )
+    return energy, x
+
+
+def key_frames(observed: F64, px_per_m: F64) -> tuple[Frames, Frames]:
+    """Frames at rest (mouth closed, little motion) and frames spread over the clip; KEY_FRAMES in all, if there are.
+
+    observed: [n, 478, 2] px.
+    """
+    n = len(observed)
+    opening = np.linalg.norm(observed[:, 13] - observed[:, 14], axis=-1) / px_per_m
+    lips = (observed[:, [61, 291, 13, 14]] - observed[:, [1]]) / px_per_m[:, None, None]
+    speed = np.zeros(n)
+    speed[1:] = np.linalg.norm(np.diff(lips, axis=0), axis=-1).max(1)
+    count = min(n, KEY_FRAMES)
+    rest = np.sort(np.argsort(opening + speed, kind="stable")[: max(1, n // 5)])
+    rest = rest[np.unique(np.linspace(0, len(rest) - 1, max(1, int(count * REST_SHARE))).round().astype(int))]
+    other = np.setdiff1d(np.arange(n), rest)
+    spread = np.linspace(0, len(other) - 1, min(count - len(rest), len(other))).round().astype(int)
+    return rest, other[spread]
+
+
+def fit_identity(energy: Energy, start: F64, keys: tuple[Frames, Frames]) -> F64:
+    """[Ki] the subject, from frames at rest, whose expressions are held near zero, and from others."""
+    rest, other = keys
+    frames = np.concatenate([rest, other])
+    chosen = energy.select(frames)
+    chosen.strictness[: len(rest)] *= energy.weights.rest
+    return solve_subject(chosen, np.zeros(len(energy.model.identity)), start[frames]).identity
+
+
+def _runs(good: Frames, segment: NDArray[np.int32]) -> NDArray[np.int64]:
+    """[n] a number for each stretch of measured frames that follow each other within one shot."""
+    broken = (np.diff(good) != 1) | (np.diff(segment[good]) != 0)
+    return np.concatenate([[0], np.cumsum(broken)])
+
+
+def fit_frames(
+    energy: Energy,
+    start: F64,
+    identity: F64,
+    time: F64,
+    run: NDArray[np.int64],
+    progress: Callable[[int, int], None] | None = None,
+) -> F64:
+    """[n, P] expression and pose of every frame of a subject that is known."""
+    interval = float(np.median(np.diff(time))) if len(time) > 1 else 0.04
+    sd = np.repeat(energy.weights.acceleration, (energy.model.expressions, 3, 3))
+    # The integral of white noise bends by the power 1.5 of the interval.
+    precision = 1.0 / (sd * (interval / 0.04) ** 1.5) ** 2
+    smoothness = Smoothness.between(run, precision)
+    return solve_frames(energy, energy.shape(identity), start, smoothness, progress=progress)[0]
+
+
+def _track(
+    landmarks: Landmarks,
+    camera: Camera,
+    head: HeadModel,
+    energy: Energy,
+    observed: F64,
+    identity: F64,
+    x: F64,
+    good: Frames,
+) -> Track:
+    """The track of all frames; those not measured take the nearest measured frame's values."""
+    total = len(landmarks.time)
+    nearest = _nearest(total, good)
+    matrix = rotation_matrix(x[:, -6:-3])
+    expression = energy.model.arkit(x[:, :-POSE]).astype(np.float32)
+    fitted = energy.project(energy.shape(identity), x)
+    error = np.linalg.norm(fitted - energy.observed, axis=-1)
+    valid = np.zeros(total, bool)
+    valid[good] = True
+    eyes = eye_rotations(head, identity, expression, x, observed, energy)
+    return Track(
+        time=landmarks.time,
+        valid=valid,
+        confidence=confidence(
+            error / energy.px_per_m[:, None], energy.visible, landmarks.presence[good], good, total
+        ),
+        identity=identity.astype(np.float32),
+        expression=expression[nearest],
+        jaw=np.zeros((total, 3), np.float32),
+        neck=np.zeros((total, 3), np.float32),
+        eyes=eyes.astype(np.float32)[nearest],
+        rotation=rotation_axis_angle(matrix).astype(np.float32)[nearest],
+        translation=(x[:, -3:] - matrix @ energy.model.centre).astype(np.float32)[nearest],
+        focal=float(camera.focal_px),
+        principal=np.array(camera.principal_px, np.float32),
+        distortion=np.array(camera.distortion, np.float32),
+        size=landmarks.size,
+        head=f"{head.name}@{head.sha256}",
+        lip_gap_mm=_lip_gaps(head, identity, expression)[nearest],
+        reprojection_px=error.mean(1).astype(np.float32)[nearest],
+    )
+
+
+def _nearest(total: int, good: Frames) -> Frames:
+    """[T] position in `good` of the measured frame nearest to each frame."""
+    middle = (good[1:] + good[:-1]) / 2
+    return np.searchsorted(middle, np.arange(total))
+
+
+def _lip_gaps(head: HeadModel, identity: F64, expression: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[n] mm, a hundred frames at a time to bound memory."""
+    subject = identity.astype(np.float32)
+    parts = [
+        head.lip_gap_mm(head.vertices(np.broadcast_to(subject, (len(part), len(subject))), part))
+        for part in np.array_split(expression, max(1, len(expression) // 100))
+    ]
+    return np.concatenate(parts).astype(np.float32)

@@ -1,0 +1,55 @@
+"""Eye rotations in closed form from the iris landmarks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracker.energy import Energy, rotation_matrix
+from tracker.track import F64
+
+if TYPE_CHECKING:
+    from tracker.head import HeadModel
+
+IRIS_CENTRES = (473, 468)  # left, right
+EYE_RADIUS_M = 0.012  # a real eye's; the head's own eyeballs are larger and serve as lid support
+LIMIT = np.radians(45.0)
+
+
+def eye_rotations(
+    head: HeadModel, identity: F64, expression: NDArray[np.float32], x: F64, observed: F64, energy: Energy
+) -> F64:
+    """[n, 2, 3] rad, left then right: the turn that carries the head's iris, looking straight, onto the seen one.
+
+    observed: [n, 478, 2] px. Yaw turns about y and pitch about x of the head; no roll. Zero if the head's landmark
+    embedding has no irises.
+    """
+    at = [np.flatnonzero(head.landmark_embedding.landmarks == index) for index in IRIS_CENTRES]
+    out = np.zeros((len(x), 2, 3))
+    if any(len(index) != 1 for index in at):
+        return out
+    rows = np.concatenate(at)
+    straight = _embedded(head, rows, identity, expression) - energy.model.centre
+    matrix = rotation_matrix(x[:, -6:-3])
+    camera = straight @ matrix.transpose(0, 2, 1) + x[:, None, -3:]
+    expected = energy.focal * camera[..., :2] / camera[..., 2:] + energy.principal
+    shift = np.zeros((len(x), 2, 3))
+    shift[..., :2] = (observed[:, IRIS_CENTRES] - expected) * camera[..., 2:] / energy.focal
+    moved = shift @ matrix / EYE_RADIUS_M  # back to head axes
+    out[..., 1] = np.arcsin(np.clip(moved[..., 0], -np.sin(LIMIT), np.sin(LIMIT)))
+    out[..., 0] = -np.arcsin(np.clip(moved[..., 1], -np.sin(LIMIT), np.sin(LIMIT)))
+    return out
+
+
+def _embedded(
+    head: HeadModel, rows: NDArray[np.int64], identity: F64, expression: NDArray[np.float32]
+) -> F64:
+    """[n, len(rows), 3] m, embedded landmarks of the moving face with its eyes straight."""
+    embedding = head.landmark_embedding
+    corners = np.asarray(head.faces)[embedding.triangles[rows]]
+    share = embedding.barycentric[rows]
+    neutral = head.template[corners] + np.tensordot(identity, head.identity_basis[:, corners], axes=1)
+    moved = neutral + np.tensordot(expression, head.expression_basis[:, corners], axes=1)
+    return np.einsum("lc,nlcx->nlx", share, moved)

@@ -1,0 +1,206 @@
+"""Bounded Levenberg-Marquardt for a face clip: shared identity by elimination, smooth time lines by a band."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from tracker.energy import POSE, Energy, Quadratic
+from tracker.track import F64
+
+CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
+Progress = Callable[[int, int], None]
+
+
+def clamp(x: F64) -> F64:
+    """The weights of x [n, P] cut to 0..1."""
+    out = x.copy()
+    np.clip(out[:, :-POSE], 0.0, 1.0, out=out[:, :-POSE])
+    return out
+
+
+def held(x: F64, gradient: F64) -> NDArray[np.bool_]:
+    """[n, P] weights at a bound that the energy pushes further out: they stay where they are in this step."""
+    out = np.zeros(x.shape, bool)
+    w, g = x[:, :-POSE], gradient[:, :-POSE]
+    out[:, :-POSE] = ((w <= 0) & (g > 0)) | ((w >= 1) & (g < 0))
+    return out
+
+
+def freeze(gradient: F64, hessian: F64, fixed: NDArray[np.bool_]) -> tuple[F64, F64]:
+    """Gradient and Hessian [n, P(, P)] whose solution leaves the fixed unknowns unmoved."""
+    free = ~fixed
+    hessian = hessian * (free[:, :, None] & free[:, None, :])
+    index = np.arange(hessian.shape[1])
+    hessian[:, index, index] += fixed
+    return gradient * free, hessian
+
+
+@dataclass(frozen=True)
+class Solution:
+    """identity [Ki]; x [n, P]; value: the energy; steps: accepted ones."""
+
+    identity: F64
+    x: F64
+    value: float
+    steps: int
+
+
+def solve_subject(
+    energy: Energy, identity: F64, x: F64, steps: int = 20, tolerance: float = 1e-4
+) -> Solution:
+    """Identity and the n key frames together: Levenberg-Marquardt, per-frame blocks eliminated (Schur)."""
+    prior = energy.weights.identity * len(x)
+
+    def total(identity: F64, x: F64) -> float:
+        return float(energy.value(energy.shape(identity), x).sum() + 0.5 * prior * identity @ identity)
+
+    damping, value, done = 1e-3, total(identity, x), 0
+    for _ in range(steps):
+        quadratic = energy.linearize(energy.shape(identity), x, with_identity=True)
+        step_identity, step = _schur_step(quadratic, identity, x, prior, damping)
+        trial_identity, trial = identity + step_identity, clamp(x + step)
+        trial_value = total(trial_identity, trial)
+        if trial_value >= value:
+            damping *= 10
+            if damping > 1e6:
+                break
+            continue
+        gain, value = value - trial_value, trial_value
+        identity, x, damping, done = trial_identity, trial, max(damping / 5, 1e-6), done + 1
+        if gain < tolerance * value:
+            break
+    return Solution(identity, x, value, done)
+
+
+def _schur_step(quadratic: Quadratic, identity: F64, x: F64, prior: float, damping: float) -> tuple[F64, F64]:
+    """Step of the identity [Ki] and of the frames [n, P]."""
+    k = len(identity)
+    gradient, block = freeze(
+        quadratic.gradient[:, k:], quadratic.hessian[:, k:, k:], held(x, quadratic.gradient[:, k:])
+    )
+    cross = quadratic.hessian[:, :k, k:] * ~held(x, quadratic.gradient[:, k:])[:, None]
+    index = np.arange(block.shape[1])
+    block[:, index, index] *= 1 + damping
+    solved = np.linalg.solve(block, np.concatenate([cross.transpose(0, 2, 1), gradient[..., None]], axis=2))
+    shared = quadratic.hessian[:, :k, :k].sum(0) + prior * np.eye(k)
+    shared[np.arange(k), np.arange(k)] *= 1 + damping
+    shared -= np.einsum("nkp,npj->kj", cross, solved[..., :k])
+    right = -(quadratic.gradient[:, :k].sum(0) + prior * identity) + np.einsum(
+        "nkp,np->k", cross, solved[..., k]
+    )
+    step_identity = np.linalg.solve(shared, right)
+    return step_identity, -solved[..., k] - solved[..., :k] @ step_identity
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """Second differences along time, inside unbroken runs: triple [n-2] 0/1, precision [P]."""
+
+    triple: F64
+    precision: F64
+
+    @classmethod
+    def between(cls, run: NDArray[np.integer], precision: F64) -> Smoothness:
+        """`run` [n]: frames with the same number in a row follow each other without a break."""
+        return cls(((run[2:] == run[1:-1]) & (run[1:-1] == run[:-2])).astype(np.float64), precision)
+
+    def value(self, x: F64) -> float:
+        """Energy of x [n, P]."""
+        bend = x[2:] - 2 * x[1:-1] + x[:-2]
+        return 0.5 * float((self.triple[:, None] * bend**2 * self.precision).sum())
+
+    def gradient(self, x: F64) -> F64:
+        """[n, P]."""
+        bend = (x[2:] - 2 * x[1:-1] + x[:-2]) * self.triple[:, None] * self.precision
+        out = np.zeros_like(x)
+        out[2:] += bend
+        out[1:-1] -= 2 * bend
+        out[:-2] += bend
+        return out
+
+    def bands(self, n: int) -> tuple[F64, F64, F64]:
+        """[n, P] each: the Hessian's diagonal and its couplings of frame i with i + 1 and i + 2."""
+        diagonal, first, second = np.zeros((3, n))
+        diagonal[2:] += self.triple
+        diagonal[1:-1] += 4 * self.triple
+        diagonal[:-2] += self.triple
+        first[1:-1] -= 2 * self.triple
+        first[:-2] -= 2 * self.triple
+        second[:-2] += self.triple
+        return tuple(band[:, None] * self.precision for band in (diagonal, first, second))  # type: ignore[return-value]
+
+
+def solve_frames(
+    energy: Energy,
+    shape: F64,
+    x: F64,
+    smoothness: Smoothness,
+    steps: int = 10,
+    tolerance: float = 1e-4,
+    progress: Progress | None = None,
+) -> tuple[F64, float]:
+    """All frames [n, P] of the subject `shape` [L, 3] together, smooth in time; returns x and the energy."""
+
+    def total(x: F64) -> float:
+        parts = [energy.select(part).value(shape, x[part]).sum() for part in _chunks(len(x))]
+        return float(sum(parts)) + smoothness.value(x)
+
+    damping, value = 1e-3, total(x)
+    for step in range(steps):
+        gradient, hessian = _linearize(energy, shape, x)
+        gradient += smoothness.gradient(x)
+        fixed = held(x, gradient)
+        while True:
+            trial = clamp(x + _band_step(gradient, hessian, fixed, smoothness, damping))
+            trial_value = total(trial)
+            if trial_value < value or damping > 1e6:
+                break
+            damping *= 10
+        if progress:
+            progress(step + 1, steps)
+        if trial_value >= value:
+            break
+        gain, value, x, damping = value - trial_value, trial_value, trial, max(damping / 5, 1e-6)
+        if gain < tolerance * value:
+            break
+    return x, value
+
+
+def _chunks(n: int) -> list[slice]:
+    return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
+
+
+def _linearize(energy: Energy, shape: F64, x: F64) -> tuple[F64, F64]:
+    gradient, hessian = np.empty(x.shape), np.empty((*x.shape, x.shape[1]))
+    for part in _chunks(len(x)):
+        quadratic = energy.select(part).linearize(shape, x[part])
+        gradient[part], hessian[part] = quadratic.gradient, quadratic.hessian
+    return gradient, hessian
+
+
+def _band_step(
+    gradient: F64, hessian: F64, fixed: NDArray[np.bool_], smoothness: Smoothness, damping: float
+) -> F64:
+    """Solve the block-pentadiagonal system by a banded Cholesky factorization; step [n, P]."""
+    n, p = gradient.shape
+    gradient, hessian = freeze(gradient, hessian, fixed)
+    free = ~fixed
+    diagonal, first, second = smoothness.bands(n)
+    band = np.zeros((2 * p + 1, n, p))
+    for offset in range(p):
+        index = np.arange(p - offset)
+        band[offset, :, : p - offset] = hessian[:, index + offset, index]
+    band[0] += diagonal * free
+    band[0] *= 1 + damping
+    band[0] += 1e-9
+    band[p, :-1] = (first * free)[:-1] * free[1:]
+    band[2 * p, :-2] = (second * free)[:-2] * free[2:]
+    factor = cholesky_banded(
+        band.reshape(2 * p + 1, n * p), lower=True, overwrite_ab=True, check_finite=False
+    )
+    return cho_solve_banded((factor, True), -gradient.ravel(), check_finite=False).reshape(n, p)
