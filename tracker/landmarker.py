@@ -1,8 +1,9 @@
 """478 face landmarks and 52 blendshape scores per frame, with Google's Face Landmarker networks.
 
-Pixel centres are at integers throughout. The network's own coordinates put them at halves (a mirror test shows
-a shift of half a crop pixel); sampling the crop at its pixels' centres and reading the output in units of the
-crop's width, edge to edge, leaves none.
+Pixel centres are at integers throughout. The network's own coordinates put them at halves (a mirror test
+shows a shift of half a crop pixel); sampling the crop at its pixels' centres and reading the output in units of the
+crop's width, edge to edge, leaves none. Every crop is also read mirrored and the two are averaged: on
+rendered heads this takes a fifth off the jitter and an eighth off the error of the lips, for 6 ms a frame.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from tracker.landmark_indices import (
     BLENDSHAPE_INPUT,
     BLENDSHAPE_NAMES,
     LEFT_EYE_OUTER,
+    MIRRORED,
     POINTS,
     RIGHT_EYE_OUTER,
 )
@@ -89,6 +91,11 @@ def crop(rgb: NDArray[np.uint8], roi: Roi) -> NDArray[np.uint8]:
     # Pixel i of the crop is centred at (i + 0.5) / INPUT_SIZE of the unit square.
     linear = to_picture[:, :2] / INPUT_SIZE
     offset = to_picture[:, 2] + linear @ (0.5, 0.5)
+    # Reading single pixels of a far larger region would alias: average whole blocks first.
+    block = int(roi.side / INPUT_SIZE)
+    if block > 1:
+        rgb, corner = _shrunk(rgb, roi, block)
+        linear, offset = linear / block, (offset - corner + 0.5) / block - 0.5
     return cv2.warpAffine(
         rgb,
         np.column_stack([linear, offset]),
@@ -96,6 +103,17 @@ def crop(rgb: NDArray[np.uint8], roi: Roi) -> NDArray[np.uint8]:
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
+
+
+def _shrunk(rgb: NDArray[np.uint8], roi: Roi, block: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """The picture around `roi`, blocks of block x block pixels averaged, and that part's corner (x, y) px."""
+    size = np.array([rgb.shape[1], rgb.shape[0]])
+    reach = roi.side * np.sqrt(0.5) + block
+    low = np.clip(np.floor(np.array([roi.x, roi.y]) - reach), 0, size - block).astype(np.int64)
+    blocks = np.clip((2 * reach) // block, 1, (size - low) // block).astype(np.int64)
+    (left, top), (right, bottom) = low, low + blocks * block
+    part = rgb[top:bottom, left:right]
+    return cv2.resize(part, tuple(map(int, blocks)), interpolation=cv2.INTER_AREA), low
 
 
 class FaceLandmarker:
@@ -121,15 +139,24 @@ class FaceLandmarker:
         Returns points [478, 3] (x, y in picture pixels, z in the same scale), presence 0..1, blendshapes [52]
         in the order of BLENDSHAPE_NAMES, 0..1. They are meaningless when presence is low.
         """
-        # The rest of the outputs is a flag for a tongue, which the 52 scores do without.
-        raw, presence_logit, _ = self._landmarks(crop(rgb, roi).astype(np.float32)[None] / 255.0)
-        unit = raw.reshape(POINTS, 3) / INPUT_SIZE
+        picture = crop(rgb, roi).astype(np.float32) / 255.0
+        unit, logit = self._read(picture)
+        mirrored, mirrored_logit = self._read(np.ascontiguousarray(picture[:, ::-1]))
+        mirrored = mirrored[MIRRORED]
+        mirrored[:, 0] = 1 - mirrored[:, 0]
+        unit = (unit + mirrored) / 2
         to_picture = roi.to_picture()
         xy = unit[:, :2] @ to_picture[:, :2].T + to_picture[:, 2]
         points = np.column_stack([xy, unit[:, 2] * roi.side]).astype(np.float32)
         (scores,) = self._blendshapes(points[None, BLENDSHAPE_INPUT, :2])
-        presence = 1.0 / (1.0 + np.exp(-float(presence_logit.reshape(()))))
-        return points, presence, scores.reshape(52)
+        presence = 1.0 / (1.0 + np.exp(-(logit + mirrored_logit) / 2))
+        return points, float(presence), scores.reshape(52)
+
+    def _read(self, picture: F32) -> tuple[F32, float]:
+        """Points [478, 3] in units of the crop's width and the logit of presence, from one crop in 0..1."""
+        # The third output is a flag for a tongue that is out, which the 52 scores do without.
+        points, presence, _ = self._landmarks(picture[None])
+        return points.reshape(POINTS, 3) / np.float32(INPUT_SIZE), float(presence.reshape(()))
 
 
 class _Network:
@@ -195,7 +222,7 @@ def track_landmarks(
 ) -> Landmarks:
     """Landmarks of a whole clip.
 
-    frames: (time s, rgb [H, W, 3] u8) in order, all of one size, at least one. total: their number (for progress).
+    frames: (time s, rgb [H, W, 3] u8) in order, all of one size, at least one. total: how many, for progress.
     cuts: indices of frames that begin another shot, where nothing is taken over from the frame before.
     """
     tracker = LandmarkTracker(FaceLandmarker())
