@@ -1,0 +1,198 @@
+"""Opening a video or sound file. Files are untrusted: local only, limited in size and duration."""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import av
+import numpy as np
+from av.sidedata.sidedata import Type as SideData
+from numpy.typing import NDArray
+
+from personalize.errors import UserError
+
+MAX_DURATION_S = 4 * 3600.0
+MAX_SIDE_PX = 16_384
+STILL_FORMATS = ("_pipe", "image2", "gif")  # ends of the names of FFmpeg's readers of pictures
+
+
+@dataclass(frozen=True)
+class MediaInfo:
+    """What a file holds. Everything is JSON-able.
+
+    width, height: px of the upright picture with square pixels. rotation_deg: counter-clockwise turn that the
+    file asks for. fps: nominal rate. duration_s: as the container states it, 0 when it does not.
+    video_start_s: presentation time of the first picture on the container's clock.
+    audio_rate (Hz), audio_channels: 0 without sound.
+    """
+
+    path: str
+    bytes: int
+    container: str
+    video_codec: str
+    pixel_format: str
+    width: int
+    height: int
+    rotation_deg: int
+    fps: float
+    duration_s: float
+    video_start_s: float
+    has_audio: bool
+    audio_codec: str
+    audio_rate: int
+    audio_channels: int
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain dictionary for media.json."""
+        return asdict(self)
+
+
+class Source:
+    """An opened container with its first `video` and `audio` streams (None where there is none).
+
+    It reads through one file handle with no protocols allowed, so that a playlist cannot open other files.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises UserError when the file is not there or FFmpeg cannot read it."""
+        self._file = _open_file(path)
+        try:
+            options = {"protocol_whitelist": "none"}
+            self.container: Any = av.open(self._file, mode="r", container_options=options)
+        except (av.FFmpegError, OSError, ValueError) as error:
+            self._file.close()
+            reason = str(getattr(error, "strerror", None) or error).splitlines()[0]
+            raise UserError(f"{path}: not a video that can be read ({reason}); is it complete?") from None
+        streams = self.container.streams
+        self.video: Any = next((s for s in streams.video if not _is_cover(s)), None)
+        self.audio: Any = next(iter(streams.audio), None)
+
+    def __enter__(self) -> Source:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.container.close()
+        self._file.close()
+
+    def decode(self, stream: Any) -> Iterator[Any]:
+        """Frames of a stream in presentation order.
+
+        What does not decode is passed over, and a file that breaks off just ends.
+        """
+        packets = self.container.demux(stream)
+        while True:
+            try:
+                packet = next(packets)
+            except (StopIteration, av.FFmpegError):
+                return
+            try:
+                yield from packet.decode()
+            except av.FFmpegError:
+                continue
+
+
+def _open_file(path: Path) -> BinaryIO:
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise UserError(f"{path}: not a file; give a video file")
+        if status.st_size == 0:
+            raise UserError(f"{path}: the file is empty; give a complete video")
+        return path.open("rb")
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; check the name") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+
+
+def _is_cover(stream: Any) -> bool:
+    """Whether a video stream is only the cover picture of a sound file."""
+    return bool(stream.disposition & av.stream.Disposition.attached_pic)
+
+
+def frame_time(frame: Any, fallback: float) -> float:
+    """Presentation time of a decoded frame on the container's clock, s; `fallback` without one."""
+    return fallback if frame.pts is None else float(frame.pts * frame.time_base)
+
+
+def square_size(stream: Any, frame: Any) -> tuple[int, int]:
+    """(width, height) as stored, px, the width corrected for pixels that are not square."""
+    aspect = float(stream.sample_aspect_ratio or 1)
+    return (round(frame.width * aspect) if 0.1 < aspect < 10 else frame.width), frame.height
+
+
+def display_matrix(frame: Any) -> NDArray[np.int64]:
+    """[2, 2] of -1, 0, 1 that takes a row (x, y) as stored upright: quarter turns and mirrors."""
+    for side in frame.side_data:
+        if side.type == SideData.DISPLAYMATRIX:
+            numbers = np.frombuffer(bytes(memoryview(side)), dtype="<i4")
+            matrix = np.round(numbers[[0, 1, 3, 4]].reshape(2, 2) / 65536).clip(-1, 1).astype(np.int64)
+            if abs(round(float(np.linalg.det(matrix)))) == 1 and np.abs(matrix).sum() == 2:
+                return matrix
+    return np.eye(2, dtype=np.int64)
+
+
+def probe(path: Path | str) -> MediaInfo:
+    """Look at a video without decoding more than its first two pictures.
+
+    Raises UserError when there is no such file, it is not a video, has no picture stream, is a still picture,
+    has no length, or is beyond the limits on size and duration.
+    """
+    path = Path(path)
+    with Source(path) as source:
+        video, audio = source.video, source.audio
+        if video is None:
+            raise UserError(f"{path}: no picture in this file, only sound; give a video of a talking face")
+        if max(video.width, video.height) > MAX_SIDE_PX:
+            raise UserError(
+                f"{path}: {video.width}x{video.height} px; scale it to at most {MAX_SIDE_PX} px a side"
+            )
+        first = _first_pictures(path, source)
+        width, height = square_size(video, first)
+        upright = display_matrix(first)[0, 0] != 0
+        return MediaInfo(
+            path=str(path),
+            bytes=path.stat().st_size,
+            container=source.container.format.name,
+            video_codec=video.codec_context.name,
+            pixel_format=first.format.name,
+            width=width if upright else height,
+            height=height if upright else width,
+            rotation_deg=int(first.rotation),
+            fps=float(video.average_rate or video.guessed_rate or 0),
+            duration_s=_duration(path, source),
+            video_start_s=frame_time(first, 0.0),
+            has_audio=audio is not None,
+            audio_codec=audio.codec_context.name if audio else "",
+            audio_rate=audio.rate if audio else 0,
+            audio_channels=audio.channels if audio else 0,
+        )
+
+
+def _duration(path: Path, source: Source) -> float:
+    if source.video.duration:
+        duration = float(source.video.duration * source.video.time_base)
+    else:
+        duration = float(source.container.duration or 0) / av.time_base
+    if duration > MAX_DURATION_S:
+        raise UserError(
+            f"{path}: {duration / 3600:.1f} h long; cut it to under {MAX_DURATION_S / 3600:.0f} h"
+        )
+    return duration
+
+
+def _first_pictures(path: Path, source: Source) -> Any:
+    """The first picture, once it is sure that there is a second one."""
+    frames = source.decode(source.video)
+    first, second = next(frames, None), next(frames, None)
+    if first is None:
+        raise UserError(f"{path}: no picture in it can be decoded; record or export it again")
+    if second is None and source.container.format.name.endswith(STILL_FORMATS):
+        raise UserError(f"{path}: a still picture; give a video of a talking face")
+    if second is None:
+        raise UserError(f"{path}: only one picture long; give a video of a talking face, 30 s or more")
+    return first

@@ -1,0 +1,93 @@
+"""The pictures of a video, upright, at their true presentation times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from personalize.container import MAX_DURATION_S, Source, display_matrix, frame_time, probe, square_size
+from personalize.errors import UserError
+
+U8 = NDArray[np.uint8]
+
+# A damaged picture spoils those predicted from it: up to the next key frame, or this long.
+DAMAGE_S = 5.0
+_UNSPECIFIED_COLOUR, _BT709 = 2, 1  # FFmpeg's numbers of colour spaces
+
+
+class FrameReader(Iterator[tuple[float, U8]]):
+    """Pictures of a video in order: (time s from the first picture, rgb [H, W, 3] u8 with square pixels).
+
+    Times are strictly rising. After each step `damaged` says whether that picture was decoded from broken
+    data or predicted from such a picture; pictures that do not decode at all are missing. Every pass over a
+    file gives the same pictures. Raises UserError like `probe`, and beyond the limits.
+    """
+
+    def __init__(self, path: Path | str, max_side: int | None = None) -> None:
+        """max_side: shrink to at most this many px on the long side."""
+        self._path = Path(path)
+        self._max_side = max_side
+        self.info = probe(self._path)
+        self.damaged = False
+        self._pictures = self._read()
+
+    def __next__(self) -> tuple[float, U8]:
+        return next(self._pictures)
+
+    def _read(self) -> Iterator[tuple[float, U8]]:
+        start, step = self.info.video_start_s, 1 / self.info.fps if self.info.fps else 0.04
+        last, damage_end = -1.0, -1.0
+        matrix, size = np.eye(2, dtype=np.int64), (0, 0)
+        with Source(self._path) as source:
+            source.video.thread_type = "AUTO"
+            for frame in source.decode(source.video):
+                time = frame_time(frame, last + step + start) - start
+                if time <= last:
+                    continue
+                if time > MAX_DURATION_S:
+                    raise UserError(f"{self._path}: over {MAX_DURATION_S / 3600:.0f} h long; cut it")
+                if last < 0:  # later pictures are scaled to the size of the first
+                    matrix, size = display_matrix(frame), self._size(*square_size(source.video, frame))
+                if frame.is_corrupt:
+                    damage_end = time + DAMAGE_S
+                elif frame.key_frame:
+                    damage_end = -1.0
+                self.damaged = time <= damage_end
+                last = time
+                yield time, _turned(_to_rgb(frame, size), matrix)
+
+    def _size(self, width: int, height: int) -> tuple[int, int]:
+        scale = min(1.0, self._max_side / max(width, height)) if self._max_side else 1.0
+        return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:
+    """Pictures of a video, see FrameReader. `max_side`: shrink to at most this many px on the long side."""
+    return FrameReader(path, max_side)
+
+
+def _to_rgb(frame: Any, size: tuple[int, int]) -> U8:
+    """Any pixel format to [height, width, 3] u8 at `size` (width, height), as stored."""
+    # HD that does not name its colours is BT.709 by convention; FFmpeg would take BT.601.
+    hd = frame.colorspace == _UNSPECIFIED_COLOUR and frame.height >= 720
+    rgb = frame.reformat(
+        width=size[0],
+        height=size[1],
+        format="rgb24",
+        interpolation="AREA" if frame.width > size[0] else "BICUBIC",
+        src_colorspace=_BT709 if hd else None,
+    )
+    array: U8 = rgb.to_ndarray()
+    return array
+
+
+def _turned(picture: U8, matrix: NDArray[np.int64]) -> U8:
+    """The picture after `display_matrix`."""
+    (xx, xy), (yx, yy) = matrix
+    if xx == 0:  # what was y as stored becomes x
+        picture, xx, yy = picture.swapaxes(0, 1), yx, xy
+    return np.ascontiguousarray(picture[:: int(yy), :: int(xx)])
