@@ -62,7 +62,7 @@ def solve_subject(
     damping, value, done = 1e-3, total(identity, x), 0
     for _ in range(steps):
         quadratic = energy.linearize(energy.shape(identity), x, with_identity=True)
-        step_identity, step = _schur_step(quadratic, identity, x, prior, damping)
+        step_identity, step = schur_step(quadratic, identity, x, prior, damping)
         trial_identity, trial = identity + step_identity, clamp(x + step)
         trial_value = total(trial_identity, trial)
         if trial_value >= value:
@@ -77,13 +77,12 @@ def solve_subject(
     return Solution(identity, x, value, done)
 
 
-def _schur_step(quadratic: Quadratic, identity: F64, x: F64, prior: float, damping: float) -> tuple[F64, F64]:
+def schur_step(quadratic: Quadratic, identity: F64, x: F64, prior: float, damping: float) -> tuple[F64, F64]:
     """Step of the identity [Ki] and of the frames [n, P]."""
     k = len(identity)
-    gradient, block = freeze(
-        quadratic.gradient[:, k:], quadratic.hessian[:, k:, k:], held(x, quadratic.gradient[:, k:])
-    )
-    cross = quadratic.hessian[:, :k, k:] * ~held(x, quadratic.gradient[:, k:])[:, None]
+    fixed = held(x, quadratic.gradient[:, k:])
+    gradient, block = freeze(quadratic.gradient[:, k:], quadratic.hessian[:, k:, k:], fixed)
+    cross = quadratic.hessian[:, :k, k:] * ~fixed[:, None]
     index = np.arange(block.shape[1])
     block[:, index, index] *= 1 + damping
     solved = np.linalg.solve(block, np.concatenate([cross.transpose(0, 2, 1), gradient[..., None]], axis=2))
@@ -156,7 +155,7 @@ def solve_frames(
         gradient += smoothness.gradient(x)
         fixed = held(x, gradient)
         while True:
-            trial = clamp(x + _band_step(gradient, hessian, fixed, smoothness, damping))
+            trial = clamp(x + band_step(gradient, hessian, fixed, smoothness, damping))
             trial_value = total(trial)
             if trial_value < value or damping > 1e6:
                 break
@@ -183,7 +182,7 @@ def _linearize(energy: Energy, shape: F64, x: F64) -> tuple[F64, F64]:
     return gradient, hessian
 
 
-def _band_step(
+def band_step(
     gradient: F64, hessian: F64, fixed: NDArray[np.bool_], smoothness: Smoothness, damping: float
 ) -> F64:
     """Solve the block-pentadiagonal system by a banded Cholesky factorization; step [n, P]."""

@@ -1,0 +1,143 @@
+import numpy as np
+import pytest
+
+from tracker.energy import (
+    FACING,
+    Energy,
+    LandmarkModel,
+    Weights,
+    left_jacobian,
+    rotation_axis_angle,
+    rotation_matrix,
+    rotation_vector,
+    visibility,
+)
+
+IDENTITIES, EXPRESSIONS, POINTS = 4, 5, 30
+
+
+def random_model(seed: int = 0) -> LandmarkModel:
+    rng = np.random.default_rng(seed)
+    mean = rng.normal(size=(POINTS, 3)) * [0.05, 0.06, 0.02]
+    return LandmarkModel(
+        landmarks=np.arange(POINTS, dtype=np.int32),
+        mean=mean - mean.mean(0),
+        identity=rng.normal(size=(IDENTITIES, POINTS, 3)) * 0.003,
+        expression=rng.normal(size=(EXPRESSIONS, POINTS, 3)) * 0.005,
+        centre=np.array([0.0, 0.03, 0.08]),
+        normals=np.tile([0.0, 0.0, 1.0], (POINTS, 1)),
+        pairs=np.array([[0, 1], [2, 3]]),
+        prior=np.full(EXPRESSIONS, 5.0),
+        close=0,
+        open=1,
+    )
+
+
+def random_energy(frames: int, seed: int = 1) -> tuple[Energy, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    x = np.concatenate(
+        [
+            rng.uniform(0.1, 0.6, (frames, EXPRESSIONS)),
+            rng.normal(size=(frames, 3)) * 0.3,
+            [0.0, 0.0, 0.6] + rng.normal(size=(frames, 3)) * 0.02,
+        ],
+        axis=1,
+    )
+    energy = Energy(
+        model=random_model(),
+        weights=Weights(),
+        focal=900.0,
+        principal=np.array([320.0, 240.0]),
+        observed=np.zeros((frames, POINTS, 2)),
+        px_per_m=np.full(frames, 1500.0),
+        visible=rng.uniform(0.1, 1.0, (frames, POINTS)),
+        strictness=rng.uniform(1.0, 3.0, frames),
+    )
+    energy.observed[:] = energy.project(energy.model.mean, x) + rng.normal(size=energy.observed.shape) * 3
+    return energy, x
+
+
+def test_gradient_of_identity_and_frames_matches_finite_differences():
+    energy, x = random_energy(3)
+    identity = np.array([0.5, -0.2, 0.1, 0.8])
+    analytic = energy.linearize(energy.shape(identity), x, with_identity=True)
+    both = np.concatenate([np.tile(identity, (3, 1)), x], axis=1)
+
+    def value(both):
+        return energy.value(energy.shape(both[0, :IDENTITIES]), both[:, IDENTITIES:])
+
+    np.testing.assert_allclose(analytic.value, value(both))
+    for column in range(both.shape[1]):
+        step = np.zeros(both.shape[1])
+        step[column] = 1e-6
+        numeric = (value(both + step) - value(both - step)) / 2e-6
+        np.testing.assert_allclose(analytic.gradient[:, column], numeric, rtol=1e-4, atol=1e-3)
+
+
+def test_hessian_is_symmetric_and_convex():
+    energy, x = random_energy(2)
+    hessian = energy.linearize(energy.model.mean, x).hessian
+    np.testing.assert_allclose(hessian, hessian.transpose(0, 2, 1), rtol=1e-9, atol=1e-9)
+    assert (np.linalg.eigvalsh(hessian) > 0).all()
+
+
+def test_a_landmark_far_off_hardly_pulls():
+    energy, x = random_energy(1)
+    energy.observed[:] = energy.project(energy.model.mean, x)
+    near, far = energy.observed.copy(), energy.observed.copy()
+    near[0, 10, 0] += 5
+    far[0, 10, 0] += 500
+    pulls = []
+    for observed in (near, far):
+        energy.observed[:] = observed
+        pulls.append(np.abs(energy.linearize(energy.model.mean, x).gradient[0, -3]))
+    assert pulls[1] < 0.2 * pulls[0]
+
+
+def test_project_follows_the_opencv_camera():
+    energy, x = random_energy(1)
+    x[:] = 0
+    x[0, -1] = 0.5
+    shape = np.zeros((POINTS, 3))
+    shape[0] = [0.01, 0.02, 0.1]  # to the subject's left, up, out of the face
+    pixel = energy.project(shape, x)[0, 0]
+    np.testing.assert_allclose(pixel, [320 + 900 * 0.01 / 0.4, 240 - 900 * 0.02 / 0.4])
+
+
+def test_head_weights_keep_mouth_close_under_jaw_open():
+    weights = np.random.default_rng(0).uniform(0, 1, (100, EXPRESSIONS))
+    arkit = random_model().arkit(weights)
+    assert (arkit[:, 0] <= arkit[:, 1]).all()
+    assert arkit.min() >= 0
+    assert arkit.max() <= 1
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.4, 1.5])
+def test_rotations_round_trip(angle: float):
+    rotation = np.array([[0.3, -0.8, 0.52]])
+    rotation *= angle / np.linalg.norm(rotation)
+    matrix = rotation_matrix(rotation)
+    np.testing.assert_allclose(rotation_vector(matrix), rotation, atol=1e-9)
+    whole = rotation_axis_angle(matrix)
+    np.testing.assert_allclose(rotation_matrix(whole) @ FACING, matrix, atol=1e-9)
+
+
+def test_left_jacobian_matches_finite_differences():
+    rotation = np.array([[0.0, 0.0, 0.0], [0.4, -0.2, 0.9]])
+    jacobian = left_jacobian(rotation)
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-6
+        turn = rotation_matrix(rotation + step) @ rotation_matrix(rotation).transpose(0, 2, 1)
+        np.testing.assert_allclose(
+            np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1), jacobian[..., axis] * 1e-6, atol=1e-11
+        )
+
+
+def test_skin_turned_away_counts_little():
+    model = random_model()
+    rotation = np.array([[0.0, 0.0, 0.0], [0.0, np.pi, 0.0]])
+    seen = visibility(model, rotation, np.tile([0.0, 0.0, 1.0], (2, 1)))
+    assert (seen[0] == 1).all()
+    assert (seen[1] == seen[1].min()).all()
+    assert 0 < seen[1].min() < 0.1

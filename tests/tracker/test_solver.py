@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+
+from tracker.energy import POSE, Quadratic
+from tracker.solver import Smoothness, band_step, clamp, held, schur_step
+
+FRAMES, WEIGHTS, IDENTITIES = 7, 3, 4
+UNKNOWNS = WEIGHTS + POSE
+
+
+def random_blocks(rng: np.random.Generator, size: int) -> np.ndarray:
+    root = rng.normal(size=(FRAMES, size, size))
+    return root @ root.transpose(0, 2, 1) + np.eye(size)
+
+
+def second_differences(run: np.ndarray) -> np.ndarray:
+    """[m, FRAMES], one row for each three frames in a row of the same run."""
+    rows = []
+    for i in range(FRAMES - 2):
+        if run[i] == run[i + 1] == run[i + 2]:
+            row = np.zeros(FRAMES)
+            row[i : i + 3] = [1, -2, 1]
+            rows.append(row)
+    return np.array(rows).reshape(-1, FRAMES)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def smoothness(rng: np.random.Generator, run: np.ndarray) -> tuple[Smoothness, np.ndarray]:
+    precision = rng.uniform(0.5, 2.0, UNKNOWNS)
+    bend = second_differences(run)
+    return Smoothness.between(run, precision), np.kron(bend.T @ bend, np.diag(precision))
+
+
+def test_smoothness_is_the_quadratic_form_and_its_gradient(rng):
+    term, dense = smoothness(rng, np.array([0, 0, 0, 0, 1, 1, 1]))
+    x = rng.normal(size=(FRAMES, UNKNOWNS))
+    assert term.value(x) == pytest.approx(0.5 * x.ravel() @ dense @ x.ravel())
+    np.testing.assert_allclose(term.gradient(x).ravel(), dense @ x.ravel(), atol=1e-12)
+
+
+@pytest.mark.parametrize("run", [[0, 0, 0, 0, 0, 0, 0], [0, 0, 0, 1, 1, 1, 1], [0, 1, 1, 2, 2, 3, 3]])
+def test_band_step_solves_the_dense_system(rng, run):
+    term, dense = smoothness(rng, np.array(run))
+    gradient, blocks = rng.normal(size=(FRAMES, UNKNOWNS)), random_blocks(rng, UNKNOWNS)
+    for frame in range(FRAMES):
+        part = slice(frame * UNKNOWNS, (frame + 1) * UNKNOWNS)
+        dense[part, part] += blocks[frame]
+    expected = -np.linalg.solve(dense, gradient.ravel()).reshape(FRAMES, UNKNOWNS)
+    fixed = np.zeros((FRAMES, UNKNOWNS), bool)
+    np.testing.assert_allclose(band_step(gradient, blocks, fixed, term, 0.0), expected, rtol=1e-6, atol=1e-8)
+
+
+def test_band_step_leaves_fixed_unknowns_and_solves_for_the_rest(rng):
+    term, dense = smoothness(rng, np.zeros(FRAMES, int))
+    gradient, blocks = rng.normal(size=(FRAMES, UNKNOWNS)), random_blocks(rng, UNKNOWNS)
+    for frame in range(FRAMES):
+        part = slice(frame * UNKNOWNS, (frame + 1) * UNKNOWNS)
+        dense[part, part] += blocks[frame]
+    fixed = rng.random((FRAMES, UNKNOWNS)) < 0.3
+    free = ~fixed.ravel()
+    step = band_step(gradient, blocks, fixed, term, 0.0)
+    assert (step[fixed] == 0).all()
+    expected = -np.linalg.solve(dense[np.ix_(free, free)], gradient.ravel()[free])
+    np.testing.assert_allclose(step.ravel()[free], expected, rtol=1e-6, atol=1e-8)
+
+
+def test_schur_step_solves_the_dense_system(rng):
+    size = IDENTITIES + UNKNOWNS
+    quadratic = Quadratic(np.zeros(FRAMES), rng.normal(size=(FRAMES, size)), random_blocks(rng, size))
+    identity, x, prior = rng.normal(size=IDENTITIES), np.full((FRAMES, UNKNOWNS), 0.5), 2.0
+    dense = np.zeros((IDENTITIES + FRAMES * UNKNOWNS,) * 2)
+    right = np.zeros(len(dense))
+    dense[:IDENTITIES, :IDENTITIES] = prior * np.eye(IDENTITIES)
+    right[:IDENTITIES] = -prior * identity
+    for frame in range(FRAMES):
+        start = IDENTITIES + frame * UNKNOWNS
+        index = np.r_[0:IDENTITIES, start : start + UNKNOWNS]
+        dense[np.ix_(index, index)] += quadratic.hessian[frame]
+        right[index] -= quadratic.gradient[frame]
+    expected = np.linalg.solve(dense, right)
+    step_identity, step = schur_step(quadratic, identity, x, prior, 0.0)
+    np.testing.assert_allclose(step_identity, expected[:IDENTITIES], rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(step.ravel(), expected[IDENTITIES:], rtol=1e-6, atol=1e-8)
+
+
+def test_weights_at_a_bound_are_held_only_when_pushed_out():
+    x = np.zeros((1, UNKNOWNS))
+    x[0, :3] = [0.0, 1.0, 0.5]
+    inward, outward = np.full((1, UNKNOWNS), 1.0), np.full((1, UNKNOWNS), -1.0)
+    np.testing.assert_array_equal(held(x, inward)[0, :3], [True, False, False])
+    np.testing.assert_array_equal(held(x, outward)[0, :3], [False, True, False])
+    assert not held(x, inward)[0, 3:].any()
+
+
+def test_clamp_cuts_weights_and_not_the_pose():
+    x = np.full((2, UNKNOWNS), -3.0)
+    np.testing.assert_array_equal(clamp(x)[:, :WEIGHTS], 0)
+    np.testing.assert_array_equal(clamp(x)[:, WEIGHTS:], -3)
