@@ -73,7 +73,9 @@ def main() -> None:
             code = INPUT_ERROR
         else:
             traceback.print_exc()
-            typer.echo("personalize: this is a bug; please report it with the lines above and log.txt", err=True)
+            typer.echo(
+                "personalize: this is a bug; please report it with the lines above and log.txt", err=True
+            )
             code = BUG
     sys.exit(code or 0)
 

@@ -13,7 +13,9 @@ from personalize.settings import Settings
 
 def run(
     video: Annotated[Path, typer.Argument(help="Video of one person talking: anything FFmpeg reads.")],
-    out: Annotated[Path | None, typer.Option(help="Run folder; VIDEO's name + .personalize if not given.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Run folder; VIDEO's name + .personalize if not given.")
+    ] = None,
     iterations: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = Settings.iterations,
     seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = Settings.seed,
     focal: Annotated[float | None, typer.Option(min=1, help="Focal length in pixels, if known.")] = None,
@@ -21,7 +23,9 @@ def run(
         float | None, typer.Option(min=0, max=2, help="Guidance scale; chosen on validation if not given.")
     ] = None,
     until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
-    from_: Annotated[str | None, typer.Option("--from", metavar="STAGE", help="Make again from here on.")] = None,
+    from_: Annotated[
+        str | None, typer.Option("--from", metavar="STAGE", help="Make again from here on.")
+    ] = None,
     force: Annotated[str | None, typer.Option(metavar="STAGE", help="Make this stage again.")] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:

@@ -5,7 +5,9 @@ The one place where the tracker's result becomes the model's input.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +15,15 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from model.checkpoint import Checkpoint
 from model.motion import FPS, Motion, topology_hash
-from tracker.head import HeadModel
+from personalize.av_sync import estimate_av_offset
+from personalize.files import write_json
+from personalize.media import read_audio
+from personalize.reporter import Reporter
+from personalize.run import RunFolder, read_frames, read_track, tool_version
+from personalize.subject_data import BASE_CHECKPOINT
+from tracker.head import HeadModel, load_head
 from tracker.track import Track
 
 F32 = NDArray[np.float32]
@@ -53,6 +62,35 @@ class Transfer:
         return np.einsum("dc,...dcx->...dx", self.weights, values[..., self.corners, :]).astype(np.float32)
 
 
+def register_run(run: RunFolder, folder: Path, report: Reporter) -> None:
+    """Write motion.npz and registration.json of a run: the motion, and where its sound lies on its clock."""
+    frames = read_frames(run.path / "ingest/frames.npz")
+    track = read_track(run.path / "refine/track.npz")
+    base = Checkpoint.load(BASE_CHECKPOINT)
+    motion, facts = register(
+        track, frames.segment, load_head(), BaseFace(base.template, base.faces, base.basis)
+    )
+    audio, start_s = read_audio(run.path / "ingest/audio.wav")
+    offset = estimate_av_offset(track.time, track.lip_gap_mm, track.valid, audio, start_s)
+    applied = offset.offset_s if offset.sure else 0.0
+    if applied:
+        report.say(
+            f"the sound is {abs(applied) * 1000:.0f} ms {'late' if applied > 0 else 'early'}: corrected"
+        )
+    provenance = {
+        "tool": "personalize",
+        "version": tool_version(),
+        "synthetic": False,
+        "source": run.video_sha256,
+        "checkpoint": None,
+        "seed": None,
+        "guidance": None,
+    }
+    dataclasses.replace(motion, provenance=provenance).save(folder / "motion.npz")
+    sound = {"av_offset_s": applied, "av_offset_estimate_s": offset.offset_s, "av_offset_sure": offset.sure}
+    write_json(folder / "registration.json", facts | sound)
+
+
 def transfer_between(base: BaseFace, template: F32, faces: NDArray[np.int32]) -> Transfer:
     """Non-rigid registration of the base mesh onto a head of another topology (Amberg et al. 2007, trimesh).
 
@@ -63,7 +101,9 @@ def transfer_between(base: BaseFace, template: F32, faces: NDArray[np.int32]) ->
     scale = float(np.linalg.norm(np.ptp(template, axis=0)) / np.linalg.norm(high - low))
     start = (base.template - (low + high) / 2) * scale + (template.min(0) + template.max(0)) / 2
     source = trimesh.Trimesh(start, base.faces, process=False)
-    matrix, _ = trimesh.registration.mesh_other(source, target, samples=2000, scale=True, icp_first=10, icp_final=30)
+    matrix, _ = trimesh.registration.mesh_other(
+        source, target, samples=2000, scale=True, icp_first=10, icp_final=30
+    )
     source.apply_transform(matrix)
     fitted = trimesh.registration.nricp_amberg(source, target, distance_threshold=0.02)
     closest, distance, triangle = trimesh.proximity.closest_point(target, fitted)
@@ -72,7 +112,9 @@ def transfer_between(base: BaseFace, template: F32, faces: NDArray[np.int32]) ->
     return Transfer(corners, weights.astype(np.float32), float(distance.mean() * 1000))
 
 
-def register(track: Track, segment: NDArray[np.int32], head: HeadModel, base: BaseFace) -> tuple[Motion, dict[str, Any]]:
+def register(
+    track: Track, segment: NDArray[np.int32], head: HeadModel, base: BaseFace
+) -> tuple[Motion, dict[str, Any]]:
     """The subject's motion in the base topology, and what registration did to it.
 
     segment: [T] i4, id of the uninterrupted shot of each frame; nothing is interpolated across two of them.
@@ -134,11 +176,8 @@ def resample(
     start_s = float(time[0])
     at = start_s + np.arange(int(np.floor((time[-1] - start_s) * FPS + 1e-6)) + 1) / FPS
     measured = np.flatnonzero(valid)
-    nearest = measured[np.abs(time[measured][None] - at[:, None]).argmin(1)] if len(measured) < 2 else None
-    if nearest is None:
-        right = np.clip(np.searchsorted(time[measured], at), 1, len(measured) - 1)
-        left_is_nearer = at - time[measured[right - 1]] < time[measured[right]] - at
-        nearest = measured[np.where(left_is_nearer, right - 1, right)]
+    middles = (time[measured][1:] + time[measured][:-1]) / 2
+    nearest = measured[np.searchsorted(middles, at)]
     result, seen = values[nearest].astype(np.float32), np.zeros(len(at), bool)
     breaks = (np.diff(segment[measured]) != 0) | (np.diff(time[measured]) > LONGEST_BRIDGE_S)
     for run in np.split(measured, np.flatnonzero(breaks) + 1):

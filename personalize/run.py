@@ -65,7 +65,9 @@ class RunFolder:
         except (OSError, ValueError) as error:
             raise UserError(f"{path}/run.json: cannot be read ({error})") from None
         if not isinstance(state, dict) or state.get("schema") != SCHEMA:
-            raise UserError(f"{path}/run.json: not a run of this version of personalize; choose another --out")
+            raise UserError(
+                f"{path}/run.json: not a run of this version of personalize; choose another --out"
+            )
         return cls(path, state)
 
     @contextmanager
@@ -76,9 +78,13 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             lock.acquire()
         except Timeout:
-            raise UserError(f"{self.path}: another personalize is working there; wait for it or use --out") from None
+            raise UserError(
+                f"{self.path}: another personalize is working there; wait for it or use --out"
+            ) from None
         except OSError as error:
-            raise UserError(f"{self.path}: cannot be written ({error.strerror}); choose another with --out") from None
+            raise UserError(
+                f"{self.path}: cannot be written ({error.strerror}); choose another with --out"
+            ) from None
         try:
             yield
         finally:

@@ -39,7 +39,8 @@ class Context:
 class Stage(ABC):
     """One step of the pipeline: typed inputs on disk -> outputs on disk.
 
-    name: folder name. version: bumped when the result changes. reads: names of the settings used.
+    name: as the user says it. folder: in the run folder. version: bumped when the result changes.
+    reads: names of the settings used.
     needs: files of the run folder used, relative to it; `video` is the video itself.
     makes: files made, relative to the stage's folder. products: files moved to the top of the run folder.
     resumes: the partial folder of an interrupted run with the same key is kept and continued.
@@ -52,6 +53,10 @@ class Stage(ABC):
     makes: ClassVar[tuple[str, ...]] = ()
     products: ClassVar[tuple[str, ...]] = ()
     resumes: ClassVar[bool] = False
+    folder: ClassVar[str] = ""
+
+    def __init_subclass__(cls) -> None:
+        cls.folder = cls.__dict__.get("folder", cls.name)
 
     def assets(self, settings: Settings) -> dict[str, str]:
         """Name -> content hash of the package's or the user's assets this stage depends on."""
@@ -64,7 +69,9 @@ class Stage(ABC):
     def key(self, context: Context) -> str:
         """Content hash of all that decides this stage's result."""
         run = context.run
-        inputs = {name: run.video_sha256 if name == VIDEO else sha256_file(run.path / name) for name in self.needs}
+        inputs = {
+            name: run.video_sha256 if name == VIDEO else sha256_file(run.path / name) for name in self.needs
+        }
         settings = dataclasses.asdict(context.settings)
         return sha256_json(
             {
@@ -79,7 +86,7 @@ class Stage(ABC):
 
 def output_paths(stage: Stage) -> list[str]:
     """All outputs of a stage, relative to the run folder."""
-    return [f"{stage.name}/{name}" for name in stage.makes] + list(stage.products)
+    return [f"{stage.folder}/{name}" for name in stage.makes] + list(stage.products)
 
 
 def is_cached(stage: Stage, key: str, run: RunFolder) -> bool:
@@ -134,7 +141,7 @@ def run_stages(
 
 def _open_partial(stage: Stage, key: str, root: Path, *, keep: bool) -> Path:
     """The folder to work in: empty, or what an interrupted run of the same key left."""
-    partial = root / f".{stage.name}.partial"
+    partial = root / f".{stage.folder}.partial"
     key_file = partial / "key"
     same = key_file.is_file() and key_file.read_text() == key
     if not (stage.resumes and keep and same):
@@ -151,7 +158,7 @@ def _publish(stage: Stage, partial: Path, root: Path) -> None:
         assert (partial / name).is_file(), f"stage {stage.name} did not make {name}"
     for name in stage.products:
         (partial / name).replace(root / name)
-    finished, old = root / stage.name, root / f".{stage.name}.old"
+    finished, old = root / stage.folder, root / f".{stage.folder}.old"
     shutil.rmtree(old, ignore_errors=True)
     if finished.exists():
         finished.rename(old)

@@ -105,7 +105,14 @@ def _draw_confidence(picture: U8, confidence: float, valid: bool, reason: str) -
     size = height / 900
     for shade_of, weight in (((0, 0, 0), 4), (colour, 2)):
         cv2.putText(
-            picture, text, (12, height - thick - 12), cv2.FONT_HERSHEY_SIMPLEX, size, shade_of, weight, cv2.LINE_AA
+            picture,
+            text,
+            (12, height - thick - 12),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            size,
+            shade_of,
+            weight,
+            cv2.LINE_AA,
         )
 
 

@@ -1,0 +1,104 @@
+"""New speech, the subject's way of speaking: motion files and films with sound."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.checkpoint import Checkpoint
+from model.errors import ModelError
+from model.motion import FPS, Motion
+from model.speech import load_encoder
+from model.synthesis import synthesize
+from personalize.errors import UserError
+from personalize.files import sha256_file
+from personalize.media import VideoWriter, on_video_clock, read_audio
+from personalize.render.face import FaceCamera
+from personalize.reporter import Reporter
+from personalize.run import tool_version
+from personalize.subject_data import speech_features
+
+FILM_SIZE = (720, 720)
+AUDIO_RATE = 48_000
+
+
+def animate_speech(
+    speech: Path,
+    subject: Path,
+    out: Path | None,
+    samples: int,
+    guidance: float | None,
+    seed: int,
+    report: Reporter,
+) -> Iterator[Path]:
+    """Write `motion.npz` and `animation.mp4` of each sample; yields their paths.
+
+    subject: a run folder or a checkpoint file. With several samples each lies in a folder of its own, `0`, `1`, …
+    Raises UserError for sound or checkpoint that cannot be used, and for an output that cannot be written.
+    """
+    path = subject / "checkpoint.safetensors" if subject.is_dir() else subject
+    if not path.is_file():
+        raise UserError(
+            f"{subject}: no checkpoint there; give a finished run folder or a checkpoint.safetensors"
+        )
+    try:
+        checkpoint = Checkpoint.load(path, encoder=load_encoder().name)
+    except ModelError as error:
+        raise UserError(str(error)) from error
+    sound, _ = read_audio(speech, AUDIO_RATE)
+    if not np.any(np.abs(sound) > 1e-4):
+        raise UserError(f"{speech}: there is no sound in it; give a recording of speech")
+    seconds = len(sound) / AUDIO_RATE
+    features = speech_features(speech, np.arange(max(1, round(seconds * FPS))) / FPS)
+    s = checkpoint.guidance if guidance is None else guidance
+    with report.stage("synthesis"):
+        motions = synthesize(
+            checkpoint, features, guidance=s, samples=samples, seed=seed, progress=report.progress
+        )
+    folder = out or Path(f"{speech.stem}.animation")
+    for index, coefficients in enumerate(motions):
+        place = folder if samples == 1 else folder / str(index)
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"{place}: cannot be written ({error.strerror}); choose another --out") from None
+        motion = Motion(
+            fps=FPS,
+            start_s=0.0,
+            template=checkpoint.template,
+            faces=checkpoint.faces,
+            basis=checkpoint.basis,
+            coefficients=coefficients,
+            valid=np.ones(len(coefficients), bool),
+            provenance={
+                "tool": "personalize",
+                "version": tool_version(),
+                "synthetic": True,
+                "source": speech.name,
+                "checkpoint": sha256_file(path),
+                "seed": seed,
+                "sample": index,
+                "guidance": s,
+            },
+        )
+        motion.save(place / "motion.npz")
+        yield place / "motion.npz"
+        with report.stage("film"):
+            write_film(place / "animation.mp4", motion, checkpoint.regions["face"], sound, report)
+        yield place / "animation.mp4"
+
+
+def write_film(
+    path: Path, motion: Motion, face: NDArray[np.integer], sound: NDArray[np.float32], report: Reporter
+) -> None:
+    """The motion from the front, 30 fps, with its sound [S] at 48 kHz from the motion's first frame on."""
+    camera = FaceCamera(motion.template, motion.faces, face, FILM_SIZE)
+    audio = on_video_clock(sound, 0.0, len(motion.valid) / motion.fps, AUDIO_RATE)
+    with VideoWriter(path, motion.fps, FILM_SIZE, audio, AUDIO_RATE) as film:
+        for frame in range(len(motion.valid)):
+            displacement = np.tensordot(motion.coefficients[frame], motion.basis, axes=1)
+            film.write(camera.picture(displacement))
+            report.progress(frame + 1, len(motion.valid))

@@ -1,0 +1,68 @@
+"""The overlay film, a small copy for the report, and the contact sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from personalize.files import write_atomic
+from personalize.media import VideoWriter, on_video_clock, read_audio, read_frames
+from personalize.quality import frame_reason
+from personalize.run import RunFolder, read_landmarks, read_track
+from personalize.run import read_frames as read_frame_table
+from tracker.head import load_head
+from tracker.overlay import contact_sheet, draw_overlay, panel_size
+
+PREVIEW_WIDTH, PREVIEW_CRF, PREVIEW_S = 720, 30, 60.0
+WORST, SPREAD = 8, 8
+AUDIO_RATE = 48_000
+
+U8 = NDArray[np.uint8]
+
+
+def write_overlay(run: RunFolder, folder: Path, progress: Callable[[int, int], None]) -> None:
+    """Write overlay.mp4 with the original sound, preview.mp4 for the report, and contact_sheet.png."""
+    track = read_track(run.path / "refine/track.npz")
+    landmarks = read_landmarks(run.path / "landmarks/landmarks.npz")
+    table = read_frame_table(run.path / "ingest/frames.npz")
+    head, total = load_head(), len(track.time)
+    shown = set(notable_frames(track.valid, track.confidence).tolist())
+    kept: dict[int, U8] = {}
+    fps = (total - 1) / float(track.time[-1]) if total > 1 else 25.0
+    width, height = panel_size(landmarks.size)
+    small = (PREVIEW_WIDTH, round(PREVIEW_WIDTH * height / (2 * width) / 2) * 2)
+    sound = on_video_clock(*read_audio(run.video, AUDIO_RATE), float(track.time[-1]) + 1 / fps, AUDIO_RATE)
+    preview_sound = sound[: round(PREVIEW_S * AUDIO_RATE)]
+    with (
+        VideoWriter(folder / "overlay.mp4", fps, (2 * width, height), sound, AUDIO_RATE) as film,
+        VideoWriter(folder / "preview.mp4", fps, small, preview_sound, AUDIO_RATE, PREVIEW_CRF) as preview,
+    ):
+        for frame, (time, rgb) in enumerate(read_frames(run.video)):
+            picture = draw_overlay(rgb, track, frame, landmarks, head, frame_reason(table, track, frame))
+            film.write(picture, time)
+            if time < PREVIEW_S:
+                preview.write(cv2.resize(picture, small, interpolation=cv2.INTER_AREA), time)
+            if frame in shown:
+                kept[frame] = picture[:, picture.shape[1] // 2 :]
+            progress(frame + 1, total)
+    sheet = contact_sheet([kept[frame] for frame in notable_frames(track.valid, track.confidence)])
+    _, png = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
+    write_atomic(folder / "contact_sheet.png", lambda stream: stream.write(png.tobytes()) and None)
+
+
+def notable_frames(valid: NDArray[np.bool_], confidence: NDArray[np.float32]) -> NDArray[np.intp]:
+    """The least certain tracked frames, apart from each other, then a spread of ordinary ones."""
+    tracked = np.flatnonzero(valid)
+    apart = max(1, len(tracked) // (4 * WORST))
+    worst: list[int] = []
+    for frame in tracked[np.argsort(confidence[tracked], kind="stable")]:
+        if all(abs(int(frame) - other) >= apart for other in worst):
+            worst.append(int(frame))
+        if len(worst) == WORST:
+            break
+    spread = tracked[np.linspace(0, len(tracked) - 1, SPREAD).round().astype(int)]
+    return np.concatenate([np.asarray(worst, np.intp), spread])

@@ -1,0 +1,186 @@
+"""The stages of the pipeline: each reads typed files, calls one function, writes typed files."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from model.checkpoint import BASE_CHECKPOINT
+from model.speech import load_encoder
+from personalize import run as files
+from personalize.evaluation.evaluate import evaluate_run
+from personalize.evaluation.report import write_report
+from personalize.files import sha256_file, write_json
+from personalize.finetune import finetune_run
+from personalize.ingest import ingest_video
+from personalize.media import read_frames, write_wav
+from personalize.overlay import write_overlay
+from personalize.quality import write_quality
+from personalize.registration import register_run
+from personalize.settings import Settings
+from personalize.stage import VIDEO, Context, Stage
+from tracker.camera import estimate_camera
+from tracker.fit import fit_track
+from tracker.head import load_head
+from tracker.landmarker import LANDMARKER_FILE, track_landmarks
+
+
+@cache
+def _asset_hash(path: Path) -> str:
+    return sha256_file(path)
+
+
+class Ingest(Stage):
+    """Video -> times, usable frames and why not, sound, split."""
+
+    name, version, needs = "ingest", 1, (VIDEO,)
+    makes = ("media.json", "frames.npz", "audio.wav", "split.json")
+
+    def make(self, context: Context, folder: Path) -> None:
+        ingested = ingest_video(context.run.video, context.report.progress)
+        for text in ingested.warnings:
+            context.report.warn(text)
+        write_json(folder / "media.json", {**ingested.media.as_json(), "warnings": ingested.warnings})
+        files.write_frames(folder / "frames.npz", ingested.frames)
+        write_wav(folder / "audio.wav", ingested.audio)
+        write_json(folder / "split.json", ingested.split)
+
+
+class LandmarkStage(Stage):
+    """478 points and 52 scores on every usable frame."""
+
+    name, version = "landmarks", 1
+    needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz",)
+
+    def assets(self, settings: Settings) -> dict[str, str]:
+        return {"face_landmarker": _asset_hash(LANDMARKER_FILE)}
+
+    def make(self, context: Context, folder: Path) -> None:
+        frames = files.read_frames(context.run.path / "ingest/frames.npz")
+        landmarks = track_landmarks(
+            read_frames(context.run.video),
+            len(frames.time),
+            cuts=set(np.flatnonzero(np.diff(frames.segment)) + 1),
+            progress=context.report.progress,
+        )
+        files.write_landmarks(folder / "landmarks.npz", landmarks)
+
+
+class CameraStage(Stage):
+    """Focal length with its uncertainty, and rigid head poses."""
+
+    name, version, reads = "camera", 1, ("focal_px",)
+    needs = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz")
+    makes = ("camera.json", "bundle.npz")
+
+    def assets(self, settings: Settings) -> dict[str, str]:
+        return {"head": load_head().sha256}
+
+    def make(self, context: Context, folder: Path) -> None:
+        root = context.run.path
+        frames = files.read_frames(root / "ingest/frames.npz")
+        camera, bundle = estimate_camera(
+            files.read_landmarks(root / "landmarks/landmarks.npz"),
+            lambda: read_frames(context.run.video),
+            load_head(),
+            focal_given=context.settings.focal_px,
+            usable=frames.usable,
+            segments=frames.segment,
+        )
+        files.write_camera(folder, camera, bundle)
+
+
+class TrackStage(Stage):
+    """One identity, and expression, pose and gaze in every frame, jointly over the clip."""
+
+    name, version = "track", 1
+    needs = ("ingest/frames.npz", "landmarks/landmarks.npz", "camera/camera.json", "camera/bundle.npz")
+    makes = ("track.npz",)
+
+    def assets(self, settings: Settings) -> dict[str, str]:
+        return {"head": load_head().sha256}
+
+    def make(self, context: Context, folder: Path) -> None:
+        root = context.run.path
+        frames = files.read_frames(root / "ingest/frames.npz")
+        track = fit_track(
+            files.read_landmarks(root / "landmarks/landmarks.npz"),
+            *files.read_camera(root / "camera"),
+            load_head(),
+            frames.usable,
+            frames.segment,
+            context.report.progress,
+        )
+        files.write_track(folder / "track.npz", track)
+
+
+class Refine(Stage):
+    """Photometric refinement: for now the landmark track as it is, and quality.csv from what there is."""
+
+    name, version = "refine", 1
+    needs, makes = ("ingest/frames.npz", "track/track.npz"), ("track.npz", "quality.csv")
+
+    def make(self, context: Context, folder: Path) -> None:
+        root = context.run.path
+        track = files.read_track(root / "track/track.npz")
+        files.write_track(folder / "track.npz", track)
+        write_quality(folder / "quality.csv", track, files.read_frames(root / "ingest/frames.npz"))
+
+
+class Overlay(Stage):
+    """The track over the video, to check by eye."""
+
+    name, version = "overlay", 1
+    needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", "refine/track.npz")
+    makes, products = ("contact_sheet.png", "preview.mp4"), ("overlay.mp4",)
+
+    def make(self, context: Context, folder: Path) -> None:
+        write_overlay(context.run, folder, context.report.progress)
+
+
+class Registration(Stage):
+    """Track -> Motion in the base model's topology, 30 fps, with the sound's offset."""
+
+    name, version = "registration", 1
+    needs = ("ingest/frames.npz", "ingest/audio.wav", "refine/track.npz")
+    makes = ("motion.npz", "registration.json")
+
+    def assets(self, settings: Settings) -> dict[str, str]:
+        return {"head": load_head().sha256, "base": _asset_hash(BASE_CHECKPOINT)}
+
+    def make(self, context: Context, folder: Path) -> None:
+        register_run(context.run, folder, context.report)
+
+
+class Finetune(Stage):
+    """Motion + speech -> the subject's checkpoint."""
+
+    name, version, reads, resumes = "finetune", 1, ("iterations", "seed", "guidance"), True
+    needs = (
+        "ingest/audio.wav",
+        "ingest/split.json",
+        "registration/motion.npz",
+        "registration/registration.json",
+    )
+    makes, products = ("log.csv", "guidance.json"), ("checkpoint.safetensors",)
+
+    def assets(self, settings: Settings) -> dict[str, str]:
+        return {"base": _asset_hash(BASE_CHECKPOINT), "encoder": load_encoder().name}
+
+    def make(self, context: Context, folder: Path) -> None:
+        finetune_run(context.run, context.settings, folder, context.report)
+
+
+class Evaluate(Stage):
+    """Metrics on the test split, one clip beside its reference, the report."""
+
+    name, folder, version, reads = "evaluate", "evaluation", 1, ("seed",)
+    needs = (VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv")
+    needs += ("overlay/preview.mp4", "overlay/contact_sheet.png", "refine/track.npz")
+    makes, products = ("metrics.json", "samples/test.mp4", "samples/test.npz"), ("report.html",)
+
+    def make(self, context: Context, folder: Path) -> None:
+        evaluation = evaluate_run(context.run, context.settings, folder, context.report)
+        write_report(context.run, evaluation, folder)

@@ -1,0 +1,69 @@
+"""A run's motion and sound as training sequences: speech features at the motion's frames, cut by the split."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.dataset import Sequence
+from model.motion import Motion
+from model.speech import load_encoder, resample
+from personalize.media import read_audio
+from personalize.run import RunFolder
+
+BASE_CHECKPOINT = Path(__file__).parent.parent / "model" / "assets" / "base.safetensors"
+Part = Literal["train", "val", "test"]
+# Shorter spans hold no whole word: they are neither learned from nor judged.
+SHORTEST_SPAN_S = 1.0
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of one part of the split: motion frames [first, last) of the run's motion."""
+
+    first: int
+    last: int
+    sequence: Sequence
+
+
+@dataclass(frozen=True)
+class SubjectData:
+    """The run's motion, the speech features [N, W] of its frames, and the spans of each part of the split."""
+
+    motion: Motion
+    features: NDArray[np.float32]
+    parts: dict[str, list[Span]]
+
+    def sequences(self, part: Part) -> list[Sequence]:
+        """The sequences of a part."""
+        return [span.sequence for span in self.parts[part]]
+
+
+def speech_features(sound: Path, at: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Features [N, W] of a sound file at times [N] s of its own clock."""
+    audio, start_s = read_audio(sound)
+    features, times = load_encoder().encode(audio)
+    return resample(features, times + start_s, at)
+
+
+def load_subject_data(run: RunFolder, style: int) -> SubjectData:
+    """Read motion, sound and split of a run. `style`: the row of the style table its sequences get."""
+    motion = Motion.load(run.path / "registration/motion.npz")
+    offset = float(run.read_json("registration/registration.json")["av_offset_s"])
+    times = motion.start_s + np.arange(len(motion.valid)) / motion.fps
+    features = speech_features(run.path / "ingest/audio.wav", times + offset)
+    split = run.read_json("ingest/split.json")
+    parts: dict[str, list[Span]] = {}
+    for part in ("train", "val", "test"):
+        parts[part] = []
+        for start_s, end_s in split[part]:
+            first, last = np.searchsorted(times, [start_s, end_s])
+            if last - first >= SHORTEST_SPAN_S * motion.fps:
+                rows = slice(int(first), int(last))
+                sequence = Sequence(motion.coefficients[rows], features[rows], motion.valid[rows], style)
+                parts[part].append(Span(rows.start, rows.stop, sequence))
+    return SubjectData(motion, features, parts)

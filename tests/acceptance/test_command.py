@@ -1,0 +1,53 @@
+"""The installed command as a user runs it: exit codes, one line for a mistake, nothing touched."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def personalize(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "cli.main", *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+
+
+def assert_refused(result: subprocess.CompletedProcess[str], *words: str) -> None:
+    assert result.returncode == 2, result.stderr
+    assert result.stdout == ""
+    lines = [line for line in result.stderr.splitlines() if line.startswith("personalize: ")]
+    assert len(lines) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    for word in words:
+        assert word in lines[0]
+
+
+def test_version_and_help(tmp_path: Path) -> None:
+    assert personalize("--version", cwd=tmp_path).stdout.startswith("personalize 0.")
+    shown = personalize("--help", cwd=tmp_path)
+    assert shown.returncode == 0
+    assert "animate" in shown.stdout and "demo" in shown.stdout
+    assert "--iterations" in personalize("run", "--help", cwd=tmp_path).stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("missing.mp4", None, "no such file"),
+        ("empty.mp4", b"", "empty"),
+        ("text.mp4", b"not a video\n", "not a video"),
+    ],
+)
+def test_what_is_no_video_is_refused_and_leaves_nothing(
+    tmp_path: Path, name: str, content: bytes | None, says: str
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    before = sorted(tmp_path.iterdir())
+    assert_refused(personalize(name, cwd=tmp_path), name, says)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_wrong_options_get_one_line(tmp_path: Path) -> None:
+    assert_refused(personalize("run", "talk.mp4", "--iterations", "none", cwd=tmp_path), "iterations")
+    assert_refused(personalize("animate", "speech.wav", "--subject", "nowhere", cwd=tmp_path), "nowhere")
