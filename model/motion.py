@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
+import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 FPS = 30.0
+# A file of displacements becomes basis form with this root mean square error over vertices and frames.
+BASIS_ERROR_M = 1e-5
+# What a motion file may hold once unpacked: an hour at 5 000 vertices as displacements is 6.5 GB, in basis
+# form 30 MB.
+LARGEST_MOTION_BYTES = 4 << 30
 
 
 class MotionError(ValueError):
@@ -32,7 +39,8 @@ class Motion:
 
     start_s: time of the first motion frame, s of presentation time; frame n is at start_s + n / fps.
     template: [D, 3] f32 m, the subject's neutral. faces: [F, 3] i32.
-    basis: [K, D, 3] f32, orthonormal in R^{3D}. coefficients: [N, K] f32 m; displacement = coefficients · basis.
+    basis: [K, D, 3] f32, orthonormal in R^{3D}. coefficients: [N, K] f32 m; displacement = coefficients ·
+    basis.
     valid: [N] bool, frames that were really seen.
     provenance: tool, version, synthetic true/false, source, checkpoint, seed, guidance.
     """
@@ -75,3 +83,108 @@ class Motion:
             stream.flush()
             os.fsync(stream.fileno())
         temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Motion:
+        """Read `motion.npz`, with `basis` and `coefficients` or with `displacements` [N, D, 3].
+
+        Displacements are brought to basis form (their principal modes, 0.01 mm root mean square error).
+        Raises MotionError, in one line, for a missing or broken file, shapes that do not fit, or more than
+        memory holds.
+        """
+        arrays = _read_arrays(path)
+        try:
+            if "basis" not in arrays and "displacements" in arrays:
+                arrays["basis"], arrays["coefficients"] = principal_modes(arrays["displacements"])
+            motion = cls(
+                fps=float(arrays["fps"]),
+                start_s=float(arrays["start_s"]),
+                template=arrays["template"].astype(np.float32),
+                faces=arrays["faces"].astype(np.int32),
+                basis=arrays["basis"].astype(np.float32),
+                coefficients=arrays["coefficients"].astype(np.float32),
+                valid=arrays["valid"].astype(np.bool_),
+                provenance=json.loads(str(arrays["provenance"])) if "provenance" in arrays else {},
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise MotionError(f"{path} is no motion file: {' '.join(str(error).split())}") from error
+        _check_shapes(motion, path)
+        if "topology" in arrays and str(arrays["topology"]) != motion.topology:
+            raise MotionError(f"{path} is damaged: its mesh is not the one its topology names")
+        return motion
+
+
+def principal_modes(displacements: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """[N, D, 3] m -> orthonormal basis [K, D, 3] and coefficients [N, K] m, exact to BASIS_ERROR_M (rms)."""
+    if displacements.ndim != 3 or displacements.shape[2] != 3 or 0 in displacements.shape:
+        raise ValueError(f"displacements of shape {displacements.shape}, not [N, D, 3]")
+    frames, vertices, _ = displacements.shape
+    flat = displacements.reshape(frames, -1)
+    left, values, right = np.linalg.svd(flat.astype(np.float64), full_matrices=False)
+    tail = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0)
+    count = max(1, int(np.argmax(tail <= BASIS_ERROR_M**2 * frames * vertices)))
+    basis = right[:count].reshape(count, vertices, 3).astype(np.float32)
+    return basis, (left[:, :count] * values[:count]).astype(np.float32)
+
+
+def _check_shapes(motion: Motion, path: Path) -> None:
+    """MotionError naming the array whose shape or content does not fit the others."""
+    vertices, modes, frames = len(motion.template), len(motion.basis), len(motion.coefficients)
+    expected = {
+        "template": (vertices, 3),
+        "faces": (len(motion.faces), 3),
+        "basis": (modes, vertices, 3),
+        "coefficients": (frames, modes),
+        "valid": (frames,),
+    }
+    for name, shape in expected.items():
+        found = getattr(motion, name).shape
+        if found != shape:
+            raise MotionError(f"{path}: {name} has shape {found}, and {shape} fits the other arrays")
+    if len(motion.faces) and not 0 <= motion.faces.min() <= motion.faces.max() < vertices:
+        raise MotionError(f"{path}: faces name vertices that do not exist (there are {vertices})")
+    if not (math.isfinite(motion.fps) and motion.fps > 0 and math.isfinite(motion.start_s)):
+        raise MotionError(f"{path}: fps {motion.fps} and start_s {motion.start_s} are not usable")
+    if not (np.isfinite(motion.basis).all() and np.isfinite(motion.coefficients[motion.valid]).all()):
+        raise MotionError(f"{path}: the motion holds values that are not finite")
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """All arrays of an npz file, never unpickling, its declared sizes checked before anything is
+    allocated.
+    """
+    if not path.is_file():
+        raise MotionError(f"there is no file {path}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+            if size > LARGEST_MOTION_BYTES:
+                raise MotionError(
+                    f"{path} would take {size / 1e9:.1f} GB of memory, {LARGEST_MOTION_BYTES / 1e9:.1f} GB is the"
+                    " most that is read; store `basis` and `coefficients` instead of `displacements`"
+                )
+            for entry in archive.infolist():
+                _check_header(archive, entry)
+        with np.load(path, allow_pickle=False) as archive_arrays:
+            return {name: archive_arrays[name] for name in archive_arrays.files}
+    except MotionError:
+        raise
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+        reason = " ".join(str(error).split())
+        raise MotionError(f"{path} is not a readable motion file (.npz): {reason}") from error
+
+
+def _check_header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
+    """ValueError where an array's header claims more bytes than its entry in the archive holds, or needs
+    pickle.
+    """
+    with archive.open(entry) as stream:
+        version = np.lib.format.read_magic(stream)
+        if version == (1, 0):
+            shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+        elif version == (2, 0):
+            shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
+        else:
+            raise ValueError(f"{entry.filename} has an unknown array format {version}")
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize > entry.file_size:
+        raise ValueError(f"{entry.filename} claims shape {shape} of {dtype}, which it does not hold")

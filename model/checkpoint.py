@@ -1,0 +1,245 @@
+"""The checkpoint file: everything that turns speech features into a person's motion, as safetensors."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from model.dataset import Standardization
+from model.diffusion import Diffusion, Parametrization, Schedule
+from model.errors import ModelError
+from model.motion import FPS, topology_hash
+from model.network import Network, NetworkConfig
+
+SCHEMA = "1"
+Kind = Literal["base", "subject"]
+State = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A model of one person (`subject`) or of several (`base`).
+
+    encoder: name of the speech encoder its features come from. styles: a name for each row of the style
+    table.
+    guidance: the default s. network, ema: parameters by name, as trained and averaged.
+    basis [K, D, 3] f32 orthonormal, template [D, 3] f32 m, faces [F, 3] i32.
+    regions: vertex indices by name (int32), e.g. lips, face, inner_lip_upper.
+    """
+
+    kind: Kind
+    encoder: str
+    styles: tuple[str, ...]
+    config: NetworkConfig
+    network: State
+    ema: State
+    basis: NDArray[np.float32]
+    template: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    standardization: Standardization
+    regions: dict[str, NDArray[np.int32]] = field(default_factory=dict)
+    schedule: Schedule = "cosine"
+    parametrization: Parametrization = "skip"
+    fps: float = FPS
+    guidance: float = 0.5
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def initial(
+        cls,
+        *,
+        kind: Kind,
+        encoder: str,
+        styles: tuple[str, ...],
+        basis: NDArray[np.float32],
+        template: NDArray[np.float32],
+        faces: NDArray[np.int32],
+        standardization: Standardization,
+        regions: dict[str, NDArray[np.int32]],
+        seed: int = 0,
+        schedule: Schedule = "cosine",
+        parametrization: Parametrization = "skip",
+        provenance: dict[str, Any] | None = None,
+    ) -> Checkpoint:
+        """An untrained model, its weights drawn from `seed`."""
+        config = NetworkConfig(len(basis), len(standardization.audio_mean), len(styles))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            state = Network(config).state_dict()
+        return cls(
+            kind=kind,
+            encoder=encoder,
+            styles=styles,
+            config=config,
+            network=state,
+            ema={name: value.clone() for name, value in state.items()},
+            basis=basis,
+            template=template,
+            faces=faces,
+            standardization=standardization,
+            regions=regions,
+            schedule=schedule,
+            parametrization=parametrization,
+            provenance=provenance or {},
+        )
+
+    @property
+    def topology(self) -> str:
+        """sha256 of D and the faces."""
+        return topology_hash(len(self.template), self.faces)
+
+    def diffusion(self) -> Diffusion:
+        """The diffusion that it was trained with."""
+        return Diffusion(self.schedule, self.parametrization)
+
+    def model(self) -> Network:
+        """The network with its averaged weights, ready to evaluate."""
+        network = Network(self.config)
+        network.load_state_dict(self.ema)
+        return network.eval().requires_grad_(False)
+
+    def style(self, name: str | None) -> int:
+        """Row of the style table; None is the last one, which in a subject's checkpoint is the subject."""
+        if name is None:
+            return len(self.styles) - 1
+        if name not in self.styles:
+            raise ModelError(f"style {name!r} is not in this checkpoint; it has {', '.join(self.styles)}")
+        return self.styles.index(name)
+
+    def with_weights(self, network: State, ema: State, **changes: Any) -> Checkpoint:
+        """A copy with other weights (and other fields)."""
+        return replace(self, network=network, ema=ema, **changes)
+
+    def save(self, path: Path) -> None:
+        """Write the file atomically (temporary name, fsync, rename)."""
+        arrays = {"basis": self.basis, "template": self.template, "faces": self.faces.astype(np.int32)}
+        arrays |= {f"standardization.{name}": value for name, value in asdict(self.standardization).items()}
+        arrays |= {f"regions.{name}": value.astype(np.int32) for name, value in self.regions.items()}
+        tensors = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
+        tensors |= {f"network.{name}": value.contiguous() for name, value in self.network.items()}
+        tensors |= {f"ema.{name}": value.contiguous() for name, value in self.ema.items()}
+        metadata = {
+            "schema": SCHEMA,
+            "kind": self.kind,
+            "topology": self.topology,
+            "encoder": self.encoder,
+            "styles": json.dumps(self.styles),
+            "fps": repr(self.fps),
+            "guidance": repr(self.guidance),
+            "provenance": json.dumps(self.provenance),
+            "network": json.dumps(asdict(self.config)),
+            "schedule": self.schedule,
+            "parametrization": self.parametrization,
+        }
+        write_atomically(path, save(tensors, metadata))
+
+    @classmethod
+    def load(cls, path: Path, *, topology: str | None = None, encoder: str | None = None) -> Checkpoint:
+        """Read a checkpoint; where given, it must be of this topology (sha256) and this speech encoder.
+
+        Raises ModelError, in one line, for a file that is missing, broken, no checkpoint, or of another kind.
+        """
+        tensors, metadata = read_tensors(path)
+        if metadata.get("schema") != SCHEMA:
+            found = metadata.get("schema", "no schema at all")
+            raise ModelError(f"{path} is not a checkpoint of schema {SCHEMA} (it has {found}); make it again")
+        try:
+            checkpoint = _assemble(tensors, metadata)
+        except (KeyError, ValueError, TypeError, RuntimeError) as error:
+            reason = " ".join(str(error).split())[:120]
+            raise ModelError(
+                f"{path} is damaged or incomplete as a checkpoint ({reason}); make it again"
+            ) from error
+        if checkpoint.topology != metadata["topology"]:
+            raise ModelError(f"{path} is damaged: its mesh is not the one its topology names; make it again")
+        if topology is not None and checkpoint.topology != topology:
+            raise ModelError(
+                f"{path} is for the mesh topology {checkpoint.topology[:12]}, and {topology[:12]} is needed:"
+                " register the motion to the checkpoint's mesh, or give a checkpoint of this one"
+            )
+        if encoder is not None and checkpoint.encoder != encoder:
+            raise ModelError(
+                f"{path} was trained on the speech encoder {checkpoint.encoder!r}, and {encoder!r} is needed:"
+                " give a checkpoint of this encoder"
+            )
+        return checkpoint
+
+
+def _assemble(tensors: dict[str, Tensor], metadata: dict[str, str]) -> Checkpoint:
+    """The checkpoint of a file's content; KeyError, ValueError, TypeError or RuntimeError where it does
+    not fit.
+    """
+
+    def group(prefix: str) -> State:
+        return {
+            name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)
+        }
+
+    kind = metadata["kind"]
+    if kind not in ("base", "subject"):
+        raise ValueError(f"kind {kind!r}")
+    config = NetworkConfig(**json.loads(metadata["network"]))
+    standardization = Standardization(**{n: t.numpy() for n, t in group("standardization.").items()})
+    basis, template, faces = (tensors[name].numpy() for name in ("basis", "template", "faces"))
+    styles = tuple(json.loads(metadata["styles"]))
+    if (
+        basis.shape != (config.coefficients, *template.shape)
+        or template.shape[1:] != (3,)
+        or faces.shape[1:] != (3,)
+    ):
+        raise ValueError(f"shapes {basis.shape}, {template.shape}, {faces.shape} of basis, template, faces")
+    if len(styles) != config.styles:
+        raise ValueError(f"{len(styles)} style names for {config.styles} styles")
+    if standardization.scale.shape != (config.coefficients,) or not (standardization.scale > 0).all():
+        raise ValueError("scale of the coefficients")
+    checkpoint = Checkpoint(
+        kind="base" if kind == "base" else "subject",
+        encoder=metadata["encoder"],
+        styles=styles,
+        config=config,
+        network=group("network."),
+        ema=group("ema."),
+        basis=basis,
+        template=template,
+        faces=faces,
+        standardization=standardization,
+        regions={name: value.numpy() for name, value in group("regions.").items()},
+        schedule="linear" if metadata["schedule"] == "linear" else "cosine",
+        parametrization="plain" if metadata["parametrization"] == "plain" else "skip",
+        fps=float(metadata["fps"]),
+        guidance=float(metadata["guidance"]),
+        provenance=json.loads(metadata["provenance"]),
+    )
+    checkpoint.model()  # every weight is there and has its shape
+    return checkpoint
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Whole or not at all: temporary name, fsync, rename."""
+    temporary = path.with_name(f".{path.name}.partial")
+    with temporary.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file; ModelError, in one line, where it is not one."""
+    if not path.is_file():
+        raise ModelError(f"there is no file {path}")
+    try:
+        with safe_open(path, framework="pt") as stream:
+            return {name: stream.get_tensor(name) for name in stream.keys()}, stream.metadata() or {}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ModelError(f"{path} is not a readable safetensors file ({error}); make it again") from error

@@ -1,0 +1,143 @@
+"""Gaussian diffusion over standardized coefficients: schedule, forward process, x0 parametrization,
+reverse rules.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from model.errors import ModelError
+
+SCHEDULES = ("cosine", "linear")
+PARAMETRIZATIONS = ("skip", "plain")
+RULES = ("posterior", "renoise", "ddim")
+Schedule = Literal["cosine", "linear"]
+Parametrization = Literal["skip", "plain"]
+Rule = Literal["posterior", "renoise", "ddim"]
+
+STEPS = 500
+# Deterministic DDIM follows a smooth path, which a tenth of the steps resolves.
+DDIM_STEPS = 50
+
+# (x_t [N, *b, K], t) -> x0hat [N, *b, K].
+Predict = Callable[[Tensor, int], Tensor]
+Overwrite = Callable[[Tensor], Tensor]
+Progress = Callable[[int, int], None]
+
+
+def cosine_alphas(steps: int) -> Tensor:
+    """abar_t of Nichol & Dhariwal 2021, eq. 17, betas clipped at 0.999: [steps] f64."""
+    t = torch.arange(steps + 1, dtype=torch.float64) / steps
+    f = torch.cos((t + 0.008) / 1.008 * math.pi / 2) ** 2
+    betas = torch.clamp(1 - f[1:] / f[:-1], max=0.999)
+    return torch.cumprod(1 - betas, dim=0)
+
+
+def linear_alphas(steps: int) -> Tensor:
+    """abar_t for betas from 1e-4 to 0.02 at 1 000 steps (Ho et al. 2020), scaled to `steps`: [steps] f64."""
+    betas = torch.linspace(0.1 / steps, 20.0 / steps, steps, dtype=torch.float64)
+    return torch.cumprod(1 - torch.clamp(betas, max=0.999), dim=0)
+
+
+class Diffusion:
+    """T steps, t = 0 (almost clean) .. T - 1 (almost pure noise)."""
+
+    def __init__(
+        self,
+        schedule: Schedule = "cosine",
+        parametrization: Parametrization = "skip",
+        steps: int = STEPS,
+    ) -> None:
+        if schedule not in SCHEDULES:
+            raise ModelError(f"schedule {schedule!r} is not known; use one of {', '.join(SCHEDULES)}")
+        if parametrization not in PARAMETRIZATIONS:
+            known = ", ".join(PARAMETRIZATIONS)
+            raise ModelError(f"parametrization {parametrization!r} is not known; use one of {known}")
+        self.schedule: Schedule = schedule
+        self.parametrization: Parametrization = parametrization
+        self.steps = steps
+        self.alphas = cosine_alphas(steps) if schedule == "cosine" else linear_alphas(steps)
+        self._signal = self.alphas.sqrt().float()
+        self._noise = (1 - self.alphas).sqrt().float()
+
+    def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
+        """q(x_t | x0) = N(sqrt(abar_t) x0, (1 - abar_t) I), at the given unit noise; t [*b], x0 [N, *b,
+        K].
+        """
+        return self._signal[t][..., None] * x0 + self._noise[t][..., None] * noise
+
+    def x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
+        """The network's output [N, *b, K] as x0hat.
+
+        `plain` is the paper's: the output itself. `skip`: sqrt(abar_t) x_t + sqrt(1 - abar_t) output, the
+        best linear guess for unit-variance x0 plus a correction: the network need not learn a gain that
+        depends on t.
+        """
+        if self.parametrization == "plain":
+            return output
+        return self._signal[t][..., None] * x_t + self._noise[t][..., None] * output
+
+    def times(self, steps: int | None, rule: Rule) -> list[int]:
+        """The diffusion steps that a reverse chain visits, from noise to clean."""
+        count = steps if steps is not None else (DDIM_STEPS if rule == "ddim" else self.steps)
+        if not 1 <= count <= self.steps:
+            raise ModelError(f"{count} sampling steps asked for; a number from 1 to {self.steps} is possible")
+        return torch.linspace(self.steps - 1, 0, count).round().int().tolist()
+
+    def reverse(
+        self, x_t: Tensor, x0: Tensor, t: int, s: int, rule: Rule, generator: torch.Generator
+    ) -> Tensor:
+        """x_s from x_t and x0hat, s < t; s = -1 is the clean end, where every rule gives x0hat.
+
+        renoise    the paper's: x_s ~ N(sqrt(abar_s) x0hat, (1 - abar_s) I)
+        posterior  q(x_s | x_t, x0hat) of DDPM (Ho et al. 2020, eq. 6-7, for a stride of t - s)
+        ddim       deterministic: the noise that x0hat implies is kept (Song et al. 2021, eq. 12, sigma = 0)
+        """
+        if s < 0:
+            return x0
+        abar_t, abar_s = float(self.alphas[t]), float(self.alphas[s])
+        if rule == "ddim":
+            noise = (x_t - math.sqrt(abar_t) * x0) / math.sqrt(1 - abar_t)
+            return math.sqrt(abar_s) * x0 + math.sqrt(1 - abar_s) * noise
+        noise = torch.randn(x_t.shape, generator=generator)
+        if rule == "renoise":
+            return math.sqrt(abar_s) * x0 + math.sqrt(1 - abar_s) * noise
+        alpha = abar_t / abar_s
+        from_x0 = math.sqrt(abar_s) * (1 - alpha) / (1 - abar_t)
+        from_xt = math.sqrt(alpha) * (1 - abar_s) / (1 - abar_t)
+        variance = (1 - alpha) * (1 - abar_s) / (1 - abar_t)
+        return from_x0 * x0 + from_xt * x_t + math.sqrt(variance) * noise
+
+    def sample(
+        self,
+        predict: Predict,
+        shape: tuple[int, ...],
+        generator: torch.Generator,
+        rule: Rule = "posterior",
+        steps: int | None = None,
+        overwrite: Overwrite | None = None,
+        progress: Progress | None = None,
+    ) -> Tensor:
+        """Run the whole reverse chain from unit noise of `shape` [N, *b, K].
+
+        overwrite: applied to every x0hat, e.g. to put known values back into the frames to keep (METHOD 5).
+        Raises ModelError for an unknown rule or an impossible number of steps.
+        """
+        if rule not in RULES:
+            raise ModelError(f"sampling rule {rule!r} is not known; use one of {', '.join(RULES)}")
+        times = self.times(steps, rule)
+        x = torch.randn(shape, generator=generator)
+        for index, t in enumerate(times):
+            x0 = predict(x, t)
+            if overwrite is not None:
+                x0 = overwrite(x0)
+            s = times[index + 1] if index + 1 < len(times) else -1
+            x = self.reverse(x, x0, t, s, rule, generator)
+            if progress is not None:
+                progress(index + 1, len(times))
+        return x

@@ -1,0 +1,136 @@
+"""Speech features to motion: guided sampling of any length, in bounded memory, with frames that may be
+kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from model.checkpoint import Checkpoint
+from model.diffusion import Diffusion, Overwrite, Progress, Rule
+from model.errors import ModelError
+from model.network import HALO, MIN_FRAMES, Condition, Network
+
+# Frames x samples of one evaluation: small enough for the processor's cache, large enough for its matrix
+# products.
+CHUNK_ROWS = 1024
+
+
+@dataclass(frozen=True)
+class Keep:
+    """Frames to keep: coefficients [N, K] m, and which of them are known, [N] or [N, K] bool."""
+
+    coefficients: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+
+
+class Guided:
+    """x0hat = u + s (c - u) for one audio, any number of samples; long motions in chunks with an exact
+    halo.
+    """
+
+    def __init__(
+        self, network: Network, diffusion: Diffusion, audio: Tensor, style: int, guidance: float, chunk: int
+    ) -> None:
+        """audio [N, W] standardized, N even; chunk: frames evaluated together, even."""
+        self._network, self._diffusion = network, diffusion
+        self._condition = network.condition(audio[:, None]).with_unconditional()
+        self._style = torch.tensor(style)
+        self._guidance = guidance
+        self._chunk = chunk
+
+    def __call__(self, x: Tensor, t: int) -> Tensor:
+        """x [N, S, K] at diffusion step t -> x0hat [N, S, K]."""
+        length = len(x)
+        pieces = []
+        for start in range(0, length, self._chunk):
+            stop = min(start + self._chunk, length)
+            first, last = max(start - HALO, 0), min(stop + HALO, length)
+            piece = self._evaluate(x[first:last], t, self._condition.frames(first, last))
+            pieces.append(piece[start - first : stop - first])
+        return torch.cat(pieces)
+
+    def _evaluate(self, x: Tensor, t: int, condition: Condition) -> Tensor:
+        """Both branches in one batch."""
+        step = torch.tensor(t)
+        both = x[:, None].expand(-1, 2, -1, -1)
+        output = self._network(both, step, condition, self._style)
+        conditional, unconditional = self._diffusion.x0(output, both, step).unbind(dim=1)
+        return unconditional + self._guidance * (conditional - unconditional)
+
+
+def _overwrite(keep: Keep, known: Tensor) -> Overwrite:
+    """Puts the known values (standardized, [N, K]) back into the frames to keep, leaving a padded tail
+    alone.
+    """
+    mask = torch.from_numpy(keep.mask if keep.mask.ndim == 2 else keep.mask[:, None])[:, None]
+
+    def overwrite(x0: Tensor) -> Tensor:
+        x0 = x0.clone()
+        x0[: len(mask)] = torch.where(mask, known[:, None], x0[: len(mask)])
+        return x0
+
+    return overwrite
+
+
+@torch.inference_mode()
+def synthesize(
+    checkpoint: Checkpoint,
+    features: NDArray[np.float32],
+    *,
+    style: str | None = None,
+    guidance: float | None = None,
+    samples: int = 1,
+    seed: int = 0,
+    rule: Rule = "posterior",
+    steps: int | None = None,
+    keep: Keep | None = None,
+    progress: Progress | None = None,
+) -> NDArray[np.float32]:
+    """Speech features [N, W] at the motion's frames -> coefficients [samples, N, K] m.
+
+    style: a name of the checkpoint's styles; None for the subject. guidance: s; None for the checkpoint's
+    own.
+    The same arguments give the same bytes. Raises ModelError for features of another width, an unknown
+    style or rule.
+    """
+    if features.ndim != 2 or features.shape[1] != checkpoint.config.audio_width or len(features) == 0:
+        width = checkpoint.config.audio_width
+        raise ModelError(
+            f"speech features of shape {features.shape}; this checkpoint takes [frames, {width}]"
+        )
+    if samples < 1:
+        raise ModelError(f"{samples} samples asked for; at least one is possible")
+    length = len(features)
+    padded = max(length + length % 2, MIN_FRAMES)
+    audio = checkpoint.standardization.audio(features)
+    audio = torch.cat([audio, audio[-1:].expand(padded - length, -1)])
+    diffusion = checkpoint.diffusion()
+    predict = Guided(
+        checkpoint.model(),
+        diffusion,
+        audio,
+        checkpoint.style(style),
+        checkpoint.guidance if guidance is None else guidance,
+        chunk=max(CHUNK_ROWS // samples // 2 * 2, 4 * HALO),
+    )
+    overwrite = None
+    if keep is not None:
+        if keep.coefficients.shape != (length, checkpoint.config.coefficients):
+            raise ModelError(f"kept motion of shape {keep.coefficients.shape} for {length} frames of speech")
+        overwrite = _overwrite(keep, checkpoint.standardization.motion(np.nan_to_num(keep.coefficients)))
+    x = diffusion.sample(
+        predict,
+        (padded, samples, checkpoint.config.coefficients),
+        torch.Generator().manual_seed(seed),
+        rule,
+        steps,
+        overwrite,
+        progress,
+    )
+    return np.ascontiguousarray(checkpoint.standardization.metres(x[:length]).transpose(1, 0, 2))
