@@ -1,7 +1,7 @@
-"""Accuracy of a track against a rendered head whose geometry is known and which the head model does not contain.
+"""Accuracy of a track against a rendered head of known geometry.
 
-The neutrals are aligned once by a similarity (absolute size and the head frame's origin are conventions), points
-correspond to their nearest there, and motion is compared about its mean.
+The neutrals are aligned once by a similarity (absolute size and the head frame's origin are conventions),
+points correspond to their nearest there, and motion is compared about its mean.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from kornia.geometry import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import from_numpy
-
 from tracker.head import HeadModel
+
 from tracker.track import F64, Track
 
 
@@ -45,9 +45,11 @@ class GroundTruth:
 
 
 def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, float]:
-    """Errors by name: mm, degrees, or r for correlations. `lip_motion_truth` is the size of what was to be found."""
+    """Errors by name: mm, degrees, or r for correlations; `lip_motion_truth` is how large the motion was."""
     fitted = axis_angle_to_rotation_matrix(from_numpy(track.rotation.astype(np.float64))).numpy()
-    neutral = head.vertices(track.identity, np.zeros(len(head.expression_names), np.float32)).astype(np.float64)
+    neutral = head.vertices(track.identity, np.zeros(len(head.expression_names), np.float32)).astype(
+        np.float64
+    )
     face, lips = head.regions["face"], head.regions["lips"]
     scale, turn, shift = _align(neutral, face, track, fitted, truth)
     aligned = scale * neutral @ turn.T + shift
@@ -55,10 +57,12 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
     near = surface < np.quantile(surface, 0.95)  # the two heads do not end at the same rim
     _, partner = cKDTree(truth.neutral).query(aligned[lips])
     seen = np.flatnonzero(track.valid)
-    moved = np.tensordot(track.expression[seen], head.expression_basis[:, lips], axes=1) @ turn.T * scale * 1e3
+    moved = np.tensordot(track.expression[seen], head.expression_basis[:, lips], axes=1)
+    moved = 1e3 * scale * moved @ turn.T
     true = truth.displacement[seen][:, partner] * 1e3
     error = (moved - moved.mean(0)) - (true - true.mean(0))
     gap, true_gap = track.lip_gap_mm[seen] * scale, truth.lip_gap_mm[seen]
+    closed = true_gap < 0.5
     jitter = np.diff(moved, 2, axis=0) - np.diff(true, 2, axis=0)
     return {
         "surface_mm": 1e3 * float(surface[near].mean()),
@@ -69,7 +73,7 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
         "opening_r": float(np.corrcoef(gap, true_gap)[0, 1]),
         "opening_rmse_mm": float(np.sqrt(np.mean((gap - true_gap) ** 2))),
         "opening_slope": float(np.polyfit(true_gap, gap, 1)[0]),
-        "closed_mm": float(np.median((gap - true_gap)[true_gap < 0.5])) if (true_gap < 0.5).any() else float("nan"),
+        "closed_mm": float(np.median((gap - true_gap)[closed])) if closed.any() else float("nan"),
         "jitter_mm": float(np.linalg.norm(jitter, axis=-1).mean()),
         "rotation_deg": rotation_error(fitted[seen], truth.rotation[seen]),
     }

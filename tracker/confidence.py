@@ -15,9 +15,10 @@ def confidence(
 ) -> F32:
     """[T] 0..1, 0 where nothing was measured.
 
-    error: [n, L] distance of fitted and observed landmarks, in any unit proportional to the face. visible: [n, L].
-    presence: [n], the landmarker's. good: [n] the measured frames of `total`. A frame loses confidence by a residual
-    above the clip's own median, by a residual that jumps from its neighbours', by a hidden side, and by presence.
+    error: [n, L] distance of fitted and observed landmarks, in any unit proportional to the face.
+    visible: [n, L]. presence: [n], the landmarker's. good: [n] the measured frames of `total`.
+    A frame loses confidence by a residual above the clip's own median, by one that jumps from its
+    neighbours', by a hidden side, and by presence.
     """
     residual = (error * visible).sum(1) / visible.sum(1)
     typical = max(float(np.median(residual)), 1e-9)

@@ -1,8 +1,8 @@
 """The landmark energy of one face: what it measures, how it is weighted, and its analytic derivatives.
 
-A frame's unknowns are one row x = [expression weights (Ke), rotation (3), translation (3)]: the rotation is the
-axis-angle r (rad) of exp(r) against a head that faces the camera upright, the translation (m) that of the centre
-of the model's landmarks, so that both stay small and hardly coupled.
+A frame's unknowns are one row x = [expression weights (Ke), rotation (3), translation (3)]: the rotation
+is the axis-angle r (rad) of exp(r) against a head that faces the camera upright, the translation (m) that
+of the centre of the model's landmarks, so that both stay small and hardly coupled.
 """
 
 from __future__ import annotations
@@ -26,15 +26,8 @@ POSE = 6  # rotation and translation
 
 # Upper and lower inner lip and eyelids, point above point: their distance is the opening.
 LIP_PAIRS = (
-    (191, 95),
-    (80, 88),
-    (81, 178),
-    (82, 87),
-    (13, 14),
-    (312, 317),
-    (311, 402),
-    (310, 318),
-    (415, 324),
+    *((191, 95), (80, 88), (81, 178), (82, 87), (13, 14)),
+    *((312, 317), (311, 402), (310, 318), (415, 324)),
 )
 LID_PAIRS = (
     *((246, 7), (161, 163), (160, 144), (159, 145), (158, 153), (157, 154), (173, 155)),
@@ -52,13 +45,13 @@ class Weights:
     noise_mm: float = 1.0
     """Standard deviation of one landmark, embedding bias included."""
     pair_noise_mm: float = 0.4
-    """Standard deviation of an opening between paired lip or lid landmarks; both err together, so it is smaller."""
+    """Standard deviation of an opening between paired lip or lid landmarks, which err together."""
     robust: float = 3.0
     """Cauchy scale, in standard deviations: residuals beyond it count ever less."""
     evidence: float = 0.1
     """Share of the landmarks that err independently; neighbours err together."""
     identity: float = 4.0
-    """Inverse variance of an identity coefficient, per key frame: a static bias repeats itself in every frame."""
+    """Inverse variance of an identity coefficient, per key frame: a static bias repeats in every frame."""
     expression_mean: float = 0.15
     """Mean of the exponential prior on an expression weight."""
     ambiguous_mean: float = 0.02
@@ -66,9 +59,9 @@ class Weights:
     expression_sd: float = 0.5
     """Standard deviation of the Gaussian prior on an expression weight."""
     rest: float = 8.0
-    """Factor on the expression prior in frames at rest, so that identity and not expression explains them."""
+    """Factor on the expression prior in frames at rest: identity, not expression, explains them."""
     acceleration: tuple[float, float, float] = (0.2, 0.01, 0.002)
-    """Standard deviation of the second difference at 25 fps of weights, rotation (rad) and translation (m)."""
+    """Standard deviation of the second difference at 25 fps: weights, rotation (rad), translation (m)."""
 
 
 AMBIGUOUS = ("jawForward", "jawLeft", "jawRight", "mouthLeft", "mouthRight", "tongueOut", "cheekPuff")
@@ -107,7 +100,7 @@ class LandmarkModel:
 
 
 def landmark_model(head: HeadModel, weights: Weights) -> LandmarkModel:
-    """The head restricted to the landmarks that the fit uses. Raises TrackError without ARKit's jaw shapes."""
+    """The head at the landmarks that the fit uses. Raises TrackError without ARKit's jaw shapes."""
     names = list(head.expression_names)
     if not {"jawOpen", "mouthClose"} <= set(names):
         raise TrackError(
@@ -126,6 +119,7 @@ def landmark_model(head: HeadModel, weights: Weights) -> LandmarkModel:
     opening, closing = names.index("jawOpen"), names.index("mouthClose")
     expression[closing] += expression[opening]
     row = {int(index): i for i, index in enumerate(embedding.landmarks[keep])}
+    pairs = [pair for pair in (*LIP_PAIRS, *LID_PAIRS) if row.keys() >= set(pair)]
     rate = np.array([weights.ambiguous_mean if n in AMBIGUOUS else weights.expression_mean for n in names])
     side = np.asarray(head.template, np.float64)[corners]
     normal = np.cross(side[:, 1] - side[:, 0], side[:, 2] - side[:, 0])
@@ -136,9 +130,7 @@ def landmark_model(head: HeadModel, weights: Weights) -> LandmarkModel:
         expression=expression,
         centre=mean.mean(0),
         normals=normal / np.linalg.norm(normal, axis=1, keepdims=True),
-        pairs=np.array(
-            [(row[a], row[b]) for a, b in (*LIP_PAIRS, *LID_PAIRS) if a in row and b in row]
-        ).reshape(-1, 2),
+        pairs=np.array([(row[a], row[b]) for a, b in pairs], int).reshape(-1, 2),
         prior=1.0 / rate,
         close=closing,
         open=opening,
@@ -218,8 +210,7 @@ class Energy:
 
     def value(self, shape: F64, x: F64) -> F64:
         """[n] the energy at x [n, P] of the subject with landmarks `shape` [L, 3] at rest."""
-        turned, camera = self._points(shape, x)
-        residual, _, _ = self._residuals(camera)
+        residual, _ = self._residuals(self._points(shape, x)[1])
         return self._robust(residual)[0].sum(1) + self._prior(x)[0]
 
     def project(self, shape: F64, x: F64) -> F64:
@@ -230,7 +221,7 @@ class Energy:
         """Gauss-Newton model at x [n, P]; with identity the unknowns are [identity (Ki), x]."""
         model, count = self.model, len(x)
         turned, camera = self._points(shape, x)
-        residual, scale, pairs = self._residuals(camera)
+        residual, scale = self._residuals(camera)
         value, weight = self._robust(residual)
         moves = np.concatenate([model.identity, model.expression]) if with_identity else model.expression
         slope = self._projection_slope(camera)
@@ -241,7 +232,7 @@ class Energy:
         swing = np.cross(turned[:, :, None, :], slope)
         jacobian[..., -6:-3] = np.einsum("nlik,nkj->nlij", swing, left_jacobian(x[:, -6:-3]))
         jacobian[..., -3:] = slope
-        rows = np.concatenate([jacobian, jacobian[:, pairs[:, 0]] - jacobian[:, pairs[:, 1]]], axis=1)
+        rows = self._with_pairs(jacobian)
         rows *= (np.sqrt(weight) * scale)[..., None, None]
         rows = rows.reshape(count, -1, rows.shape[-1])
         weighted = (residual * np.sqrt(weight)[..., None]).reshape(count, -1)
@@ -267,16 +258,18 @@ class Energy:
         o = np.zeros_like(z)
         return np.stack([1 / z, o, -x / z**2, o, 1 / z, -y / z**2], -1).reshape(*z.shape, 2, 3) * self.focal
 
-    def _residuals(self, camera: F64) -> tuple[F64, F64, NDArray[np.int64]]:
-        """Residuals [n, L+Q, 2] of landmarks, then of pairs, in standard deviations, their scales [n, L+Q], pairs."""
-        pairs, w = self.model.pairs, self.weights
-        error = self._pixels(camera) - self.observed
-        error = np.concatenate([error, error[:, pairs[:, 0]] - error[:, pairs[:, 1]]], axis=1)
-        sd_m = np.concatenate(
-            [np.full(error.shape[1] - len(pairs), w.noise_mm), np.full(len(pairs), w.pair_noise_mm)]
-        )
-        scale = 1e3 / (sd_m * self.px_per_m[:, None])
-        return error * scale[..., None], scale, pairs
+    def _with_pairs(self, rows: F64) -> F64:
+        """[n, L, ..] of landmarks, continued by the differences of the pairs: [n, L+Q, ..]."""
+        upper, lower = self.model.pairs.T
+        return np.concatenate([rows, rows[:, upper] - rows[:, lower]], axis=1)
+
+    def _residuals(self, camera: F64) -> tuple[F64, F64]:
+        """Residuals [n, L+Q, 2] of landmarks, then pairs, in standard deviations; their scales [n, L+Q]."""
+        error = self._with_pairs(self._pixels(camera) - self.observed)
+        counts = (len(self.model.mean), len(self.model.pairs))
+        sd_mm = np.repeat((self.weights.noise_mm, self.weights.pair_noise_mm), counts)
+        scale = 1e3 / (sd_mm * self.px_per_m[:, None])
+        return error * scale[..., None], scale
 
     def _robust(self, residual: F64) -> tuple[F64, F64]:
         """Half the Cauchy loss and its weight, both [n, L+Q]."""

@@ -47,8 +47,8 @@ def fit_track(
 ) -> Track:
     """The head's identity, and expression, pose and gaze in every frame, under the given camera.
 
-    usable: [T] bool, frames that may be measured. segment: [T], number of the uninterrupted shot; smoothness never
-    crosses from one to another. Raises TrackError when no frame can be measured.
+    usable: [T] bool, frames that may be measured. segment: [T], number of the uninterrupted shot;
+    smoothness never crosses from one to another. Raises TrackError when no frame can be measured.
     """
     weights = weights or Weights()
     model = landmark_model(head, weights)
@@ -66,8 +66,8 @@ def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.b
     good = np.flatnonzero(usable & finite & (landmarks.presence >= MIN_PRESENCE))
     if not len(good):
         raise TrackError(
-            f"no face to fit: of {len(usable)} frames {int(usable.sum())} are usable and none shows a face clearly; "
-            "give a clip in which one face is seen from the front"
+            f"no face to fit: of {len(usable)} frames {int(usable.sum())} are usable and none shows a face "
+            "clearly; give a clip in which one face is seen from the front"
         )
     return good
 
@@ -87,7 +87,7 @@ def _undistorted(points: NDArray[np.floating], camera: Camera) -> F64:
 def _start(
     model: LandmarkModel, weights: Weights, camera: Camera, observed: F64, points: NDArray[np.floating]
 ) -> tuple[Energy, F64]:
-    """The energy of the clip, and poses of the mean head: orthogonal Procrustes against the landmarker's own depth."""
+    """The clip's energy, and poses of the mean head by Procrustes against the landmarker's own depth."""
     seen = points[:, model.landmarks].astype(np.float64)
     centre = seen.mean(1, keepdims=True)
     covariance = (seen - centre).transpose(0, 2, 1) @ model.mean
@@ -115,7 +115,7 @@ def _start(
 
 
 def key_frames(observed: F64, px_per_m: F64) -> tuple[Frames, Frames]:
-    """Frames at rest (mouth closed, little motion) and frames spread over the clip; KEY_FRAMES in all, if there are.
+    """Frames at rest (mouth closed, little motion) and frames spread over the clip, KEY_FRAMES at most.
 
     observed: [n, 478, 2] px.
     """

@@ -21,10 +21,10 @@ LIMIT = np.radians(45.0)
 def eye_rotations(
     head: HeadModel, identity: F64, expression: NDArray[np.float32], x: F64, observed: F64, energy: Energy
 ) -> F64:
-    """[n, 2, 3] rad, left then right: the turn that carries the head's iris, looking straight, onto the seen one.
+    """[n, 2, 3] rad, left then right: the turn that carries the head's straight iris onto the seen one.
 
-    observed: [n, 478, 2] px. Yaw turns about y and pitch about x of the head; no roll. Zero if the head's landmark
-    embedding has no irises.
+    observed: [n, 478, 2] px. Yaw turns about y and pitch about x of the head; no roll. Zero if the head's
+    landmark embedding has no irises.
     """
     at = [np.flatnonzero(head.landmark_embedding.landmarks == index) for index in IRIS_CENTRES]
     out = np.zeros((len(x), 2, 3))

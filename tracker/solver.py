@@ -1,4 +1,4 @@
-"""Bounded Levenberg-Marquardt for a face clip: shared identity by elimination, smooth time lines by a band."""
+"""Bounded Levenberg-Marquardt for a face clip: identity by elimination, smooth time lines by a band."""
 
 from __future__ import annotations
 

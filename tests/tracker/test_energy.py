@@ -130,7 +130,9 @@ def test_left_jacobian_matches_finite_differences():
         step[axis] = 1e-6
         turn = rotation_matrix(rotation + step) @ rotation_matrix(rotation).transpose(0, 2, 1)
         np.testing.assert_allclose(
-            np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1), jacobian[..., axis] * 1e-6, atol=1e-11
+            np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1),
+            jacobian[..., axis] * 1e-6,
+            atol=1e-11,
         )
 
 
