@@ -32,16 +32,16 @@ def read_audio(path: Path | str, rate: int = AUDIO_RATE) -> tuple[F32, float]:
     runs: list[tuple[float, F32]] = []
     with Source(path) as source:
         frames = source.decode(source.audio) if source.audio is not None else iter(())
-        run = _Run(rate, origin)
+        run: _Run | None = None
         for frame in frames:
-            time = frame_time(frame, run.end)
-            if abs(time - run.end) > GAP_S:
-                runs.append(run.close())
+            time = frame_time(frame, run.end if run else origin)
+            if run is None or abs(time - run.end) > GAP_S:
+                runs += [run.close()] if run else []
                 run = _Run(rate, time)
             run.add(frame)
             if run.end - origin > MAX_DURATION_S:
                 raise UserError(f"{path}: over {MAX_DURATION_S / 3600:.0f} h of sound; cut it")
-        runs.append(run.close())
+        runs += [run.close()] if run else []
     runs = [(start - origin, part) for start, part in runs if len(part)]
     if not runs:
         return np.zeros(0, np.float32), 0.0

@@ -1,0 +1,201 @@
+"""First stage: what the file holds, which frames show the person, the sound on their clock, the split."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from personalize.errors import UserError
+from personalize.media import MediaInfo, on_video_clock, probe, read_audio, read_frames
+from personalize.people import FaceFollower, Tracklet, main_person
+from personalize.shots import (
+    MIN_SHOT_S,
+    REASONS,
+    THUMBNAIL,
+    Frames,
+    differences,
+    find_shots,
+    usable_seconds,
+)
+from personalize.split import make_split
+from tracker.landmarker import FaceLandmarker
+
+Progress = Callable[[int, int], None] | None
+
+SEARCH_SIDE = 960  # px: faces are looked for in pictures of at most this size
+MIN_USABLE_S = 10.0  # less is refused: fine-tuned on 5 s the model diverges
+GOOD_USABLE_S = 30.0  # less gives a warning
+MIN_EYES_PX = 20.0  # between the eyes; below, lip motion is lost in the landmarks' jitter
+GOOD_EYES_PX = 45.0
+MIN_LIGHT = 20.0  # mean grey level of the face
+MIN_SHARPNESS = 0.1  # see people.sharpness
+SILENCE = 1e-3  # peak of the sound, -60 dB
+MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it for no longer
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """Everything the ingest folder holds. audio: mono f32 at 16 kHz, sample 0 at the first picture."""
+
+    media: MediaInfo
+    frames: Frames
+    audio: NDArray[np.float32]
+    split: dict[str, Any]
+    warnings: list[str]
+
+
+def ingest_video(path: Path | str, progress: Progress = None) -> Ingested:
+    """Look through a video: times, usable frames, sound, split.
+
+    Raises UserError when the file is no video, has no sound or silence only, or under 10 s of one usable face.
+    """
+    media = probe(path)
+    audio = _read_sound(media)
+    frames, warnings = find_usable(media, progress)
+    seconds = usable_seconds(frames)
+    if seconds < MIN_USABLE_S:
+        raise UserError(_too_little(media, frames, seconds))
+    if seconds < GOOD_USABLE_S:
+        warnings.insert(
+            0, f"only {seconds:.1f} s of usable face: results improve up to about 100 s; 30 s are acceptable"
+        )
+    end = float(frames.time[-1] + np.median(np.diff(frames.time)))
+    return Ingested(media, frames, on_video_clock(*audio, end), make_split(frames), warnings)
+
+
+def _read_sound(media: MediaInfo) -> tuple[NDArray[np.float32], float]:
+    if not media.has_audio:
+        raise UserError(
+            f"{media.path}: there is no sound in this file; give a video with the person's speech"
+        )
+    samples, start = read_audio(media.path)
+    if not len(samples) or float(np.abs(samples).max()) < SILENCE:
+        raise UserError(f"{media.path}: the sound is silent; give a video with the person's speech")
+    return samples, start
+
+
+def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, list[str]]:
+    """Frames of a video with their reasons, and warnings. Two passes: shots first, then faces."""
+    time, thumbnails, corrupt = _thumbnails(media, progress)
+    change, same = differences(thumbnails)
+    segment = find_shots(time, change)
+    mine, others = main_person(_follow_faces(media, segment, progress))
+    total = len(time)
+    reason = np.full(total, REASONS.index("no_face"), np.uint8)
+    for tracklet in others:
+        reason[tracklet.frames] = REASONS.index("other_person")
+    measures = np.full((total, 7), np.nan, np.float32)  # box, eyes, light, sharpness
+    for tracklet in mine:
+        rows = _filled(tracklet, time)
+        reason[tracklet.frames[0] : tracklet.frames[-1] + 1][~np.isnan(rows[:, 0])] = 0
+        measures[tracklet.frames[0] : tracklet.frames[-1] + 1] = rows
+    scale = max(1.0, max(media.width, media.height) / SEARCH_SIDE)
+    box, eyes, light, sharp = measures[:, :4] * scale, measures[:, 4] * scale, measures[:, 5], measures[:, 6]
+    seen = reason == 0
+    marks = {
+        "blurred": seen & (sharp < MIN_SHARPNESS),
+        "too_dark": seen & (light < MIN_LIGHT),
+        "too_small": seen & (eyes < MIN_EYES_PX),
+        "cut": seen & _cut(time, segment),
+        "duplicate": same & seen,
+        "corrupt": corrupt,
+    }
+    for name, marked in marks.items():  # the last that applies stays
+        reason[marked] = REASONS.index(name)
+    frames = Frames(time, reason == 0, reason, REASONS, segment, box.astype(np.float32))
+    return frames, _warnings(frames, eyes)
+
+
+def _thumbnails(
+    media: MediaInfo, progress: Progress
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.bool_]]:
+    """First pass: times [T] s, grey thumbnails [T, h, w], and which pictures are damaged [T]."""
+    reader = read_frames(media.path, THUMBNAIL)
+    expected = max(1, round(media.duration_s * media.fps))
+    rows = []
+    for time, rgb in reader:
+        rows.append((time, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), reader.damaged))
+        if progress is not None:
+            progress(min(len(rows), expected), 2 * expected)
+    times, thumbnails, damaged = zip(*rows)
+    return np.array(times), np.stack(thumbnails), np.array(damaged)
+
+
+def _follow_faces(media: MediaInfo, segment: NDArray[np.int32], progress: Progress) -> list[Tracklet]:
+    """Second pass: every face, in pixels of a picture of at most SEARCH_SIDE."""
+    follower = FaceFollower(FaceLandmarker())
+    total = len(segment)
+    for index, (time, rgb) in enumerate(read_frames(media.path, SEARCH_SIDE)):
+        follower.add(index, time, int(segment[index]), rgb)
+        if progress is not None:
+            progress(total + index + 1, 2 * total)
+    return follower.tracklets
+
+
+def _filled(tracklet: Tracklet, time: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[n, 7] box, eyes, light and sharpness of each frame from a tracklet's first to its last.
+
+    Frames that the detector missed are interpolated; NaN where it missed too many.
+    """
+    index = np.array(tracklet.frames)
+    span = time[index[0] : index[-1] + 1]
+    known = np.column_stack([np.stack(tracklet.boxes), tracklet.eyes, tracklet.light, tracklet.sharpness])
+    rows = np.column_stack([np.interp(span, time[index], column) for column in known.T])
+    after = np.searchsorted(time[index], span)
+    gap = time[index][after] - time[index][np.maximum(after - 1, 0)]
+    rows[(gap > MAX_UNSEEN_S) & (time[index][after] != span)] = np.nan
+    return rows
+
+
+def _cut(time: NDArray[np.float64], segment: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """[T] first frames after a cut, and shots too short to track."""
+    first = np.diff(segment, prepend=segment[0]) != 0
+    length = np.array([np.ptp(time[segment == s]) for s in range(segment[-1] + 1)])
+    return first | (length[segment] < MIN_SHOT_S)
+
+
+def _warnings(frames: Frames, eyes: NDArray[np.float32]) -> list[str]:
+    texts = []
+    total = len(frames.time)
+    for number, name in enumerate(REASONS[1:], 1):
+        share = float((frames.reason == number).mean())
+        if share > 0.05:
+            texts.append(f"{share:.0%} of {total} frames left out: {DESCRIPTIONS[name]}")
+    if frames.usable.any() and float(np.median(eyes[frames.usable])) < GOOD_EYES_PX:
+        size = float(np.median(eyes[frames.usable]))
+        texts.append(f"the face is small ({size:.0f} px between the eyes): lips will be measured coarsely")
+    if (frames.reason == REASONS.index("corrupt")).any():
+        texts.append(
+            f"{int((frames.reason == REASONS.index('corrupt')).sum())} frames are damaged in the file"
+        )
+    return texts
+
+
+DESCRIPTIONS = {
+    "no_face": "no face is seen",
+    "cut": "cuts and shots too short to track",
+    "other_person": "another person's face",
+    "too_small": "the face is too small",
+    "too_dark": "the face is too dark",
+    "blurred": "the face is blurred",
+    "corrupt": "damaged in the file",
+    "duplicate": "the picture stands still",
+}
+
+
+def _too_little(media: MediaInfo, frames: Frames, seconds: float) -> str:
+    """One line: how much usable face there was, and what was in the way most."""
+    counts = np.bincount(frames.reason, minlength=len(REASONS))[1:]
+    if not frames.usable.any() and counts[0] == counts.sum():
+        return f"{media.path}: no face was found in it; give a video of a talking face"
+    text = f"{media.path}: only {seconds:.1f} s of usable face, at least {MIN_USABLE_S:.0f} s are needed"
+    if counts.any():
+        name = REASONS[1 + int(counts.argmax())]
+        text += f"; in {counts.max() / len(frames.time):.0%} of the frames {DESCRIPTIONS[name]}"
+    return text + "; give a longer or better video"

@@ -1,0 +1,167 @@
+"""Whose face is where: detections joined to tracklets, tracklets joined to people by the shape of the face."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracker.face_detector import Face
+from tracker.landmarker import FaceLandmarker, roi_from_face
+
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+PATCH = 64  # px, side of the face for light and sharpness
+MIN_OVERLAP = 0.3  # intersection over union of a face's boxes from one picture to the next
+MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
+SAMPLE_S = 0.6  # time between two looks at the face's shape
+MIN_PRESENCE = (
+    0.5  # of the landmarker: what the detector takes for a face but the landmarker does not is none
+)
+SEARCH_S = 1.0  # between searches for small faces in tiles while none is seen
+# Distance of two people's face shapes, both scaled to norm 1; see `shape_distance`.
+OTHER_PERSON = 0.05
+
+
+@dataclass(eq=False)
+class Tracklet:
+    """One face followed through one shot. The lists hold an entry a frame, but for `shapes`.
+
+    frames: indices. times: s. boxes: [4] px. eyes: px between the eyes. light: mean grey level of the face.
+    sharpness: see `sharpness`. shapes: landmarks [478, 3] px of a frame every SAMPLE_S.
+    """
+
+    segment: int
+    frames: list[int] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
+    boxes: list[F32] = field(default_factory=list)
+    eyes: list[float] = field(default_factory=list)
+    light: list[float] = field(default_factory=list)
+    sharpness: list[float] = field(default_factory=list)
+    shapes: list[F32] = field(default_factory=list)
+    next_sample: float = -1.0
+
+    @property
+    def weight(self) -> float:
+        """How much the face is in the picture: its frames times its width."""
+        return float(sum(box[2] - box[0] for box in self.boxes))
+
+
+class FaceFollower:
+    """Finds every face in every picture and joins those of one shot that overlap."""
+
+    def __init__(self, landmarker: FaceLandmarker) -> None:
+        self._landmarker = landmarker
+        self._open: list[Tracklet] = []
+        self._next_search = -1.0
+        self.tracklets: list[Tracklet] = []
+
+    def add(self, index: int, time: float, segment: int, rgb: U8) -> None:
+        """Look at the next picture [H, W, 3]."""
+        self._open = [t for t in self._open if t.segment == segment and time - t.times[-1] <= MAX_LOST_S]
+        waiting = list(self._open)
+        for face in self._find(time, rgb):
+            tracklet = max(waiting, key=lambda t: _overlap(t.boxes[-1], face.box), default=None)
+            if tracklet is None or _overlap(tracklet.boxes[-1], face.box) < MIN_OVERLAP:
+                tracklet = Tracklet(segment)
+                self.tracklets.append(tracklet)
+                self._open.append(tracklet)
+            else:
+                waiting.remove(tracklet)
+            tracklet.frames.append(index)
+            tracklet.times.append(time)
+            tracklet.boxes.append(face.box)
+            tracklet.eyes.append(float(np.linalg.norm(face.keypoints[0] - face.keypoints[1])))
+            grey = _face_patch(rgb, face.box)
+            tracklet.light.append(float(grey.mean()))
+            tracklet.sharpness.append(sharpness(grey))
+            self._sample(tracklet, time, face, rgb)
+
+    def _find(self, time: float, rgb: U8) -> list[Face]:
+        faces = self._landmarker.detect(rgb)
+        if not faces:
+            faces = [face for t in self._open for face in self._find_near(t.boxes[-1], rgb)]
+        if not faces and time >= self._next_search:
+            self._next_search = time + SEARCH_S
+            faces = self._landmarker.detect(rgb, tiled=True)
+        return faces
+
+    def _find_near(self, box: F32, rgb: U8) -> list[Face]:
+        """Faces in the surroundings of a box: one too small for the whole picture is seen there."""
+        side = 1.5 * max(box[2] - box[0], box[3] - box[1])
+        x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
+        left, top = max(0, int(x - side)), max(0, int(y - side))
+        found = self._landmarker.detect(rgb[top : int(y + side) + 1, left : int(x + side) + 1])
+        offset = np.array([left, top], np.float32)
+        return [Face(f.box + np.tile(offset, 2), f.keypoints + offset, f.score) for f in found]
+
+    def _sample(self, tracklet: Tracklet, time: float, face: Face, rgb: U8) -> None:
+        if time < tracklet.next_sample:
+            return
+        tracklet.next_sample = time + SAMPLE_S
+        points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
+        if presence >= MIN_PRESENCE:
+            tracklet.shapes.append(points)
+
+
+def _face_patch(rgb: U8, box: F32) -> U8:
+    """The face as [PATCH, PATCH] grey."""
+    left, top, right, bottom = np.round(box).astype(int)
+    part = rgb[max(0, top) : max(0, bottom) + 1, max(0, left) : max(0, right) + 1]
+    part = part if part.size else np.zeros((1, 1, 3), np.uint8)
+    small = cv2.resize(part, (PATCH, PATCH), interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+
+
+def sharpness(grey: U8) -> float:
+    """Standard deviation of the finest details of a picture over that of the whole: 0 for a flat one."""
+    return float(cv2.Laplacian(grey, cv2.CV_32F).std() / (grey.std() + 1.0))
+
+
+def _overlap(a: F32, b: F32) -> float:
+    """Intersection over union of two boxes."""
+    sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
+    shared = float(np.prod(np.maximum(sides, 0)))
+    return shared / max(float(np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2])) - shared, 1e-9)
+
+
+def align(shapes: F64, reference: F64) -> F64:
+    """Shapes [N, 478, 3] centred, scaled to norm 1 and turned onto `reference` [478, 3], which is so already."""
+    shapes = shapes - shapes.mean(1, keepdims=True)
+    shapes = shapes / np.sqrt((shapes**2).sum((1, 2), keepdims=True))
+    u, _, vt = np.linalg.svd(np.einsum("nki,kj->nij", shapes, reference))
+    u[..., -1] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    return np.einsum("nki,nij->nkj", shapes, u @ vt)
+
+
+def shape_distance(tracklet: Tracklet, reference: F64) -> float:
+    """Distance of a tracklet's median face shape from `reference` [478, 3], both of norm 1."""
+    shape = np.median(align(np.asarray(tracklet.shapes, np.float64), reference), axis=0)
+    return float(np.linalg.norm(shape - reference))
+
+
+def main_person(tracklets: list[Tracklet]) -> tuple[list[Tracklet], list[Tracklet]]:
+    """(tracklets of the person who is most in the picture, those of others). What is no face is in neither."""
+    faces = [t for t in tracklets if t.shapes]
+    if not faces:
+        return [], []
+    best: list[Tracklet] = []
+    for seed in sorted(faces, key=lambda t: -t.weight)[:5]:
+        reference = np.asarray(seed.shapes[len(seed.shapes) // 2], np.float64)
+        reference = align(reference[None], reference)[0]
+        reference = np.median(align(np.asarray(seed.shapes, np.float64), reference), axis=0)
+        reference /= np.linalg.norm(reference)
+        distance = {id(t): shape_distance(t, reference) for t in faces}
+        same: list[Tracklet] = []
+        # Nobody is in two places at once: of faces seen together the most alike is the person.
+        for t in sorted(faces, key=lambda t: distance[id(t)]):
+            if distance[id(t)] < OTHER_PERSON and not any(set(t.frames) & set(s.frames) for s in same):
+                same.append(t)
+        if sum(t.weight for t in same) > 1.05 * sum(t.weight for t in best):
+            best = same
+    mine = {id(t) for t in best}
+    return best, [t for t in faces if id(t) not in mine]

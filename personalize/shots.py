@@ -1,0 +1,91 @@
+"""Which frames of a clip are usable and why not, its uninterrupted shots, and the split in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+REASONS = (
+    "ok",
+    "no_face",
+    "cut",
+    "other_person",
+    "too_small",
+    "too_dark",
+    "blurred",
+    "corrupt",
+    "duplicate",
+)
+THUMBNAIL = 64  # px, width of the grey pictures in which cuts and duplicates are looked for
+MAX_GAP_S = 0.25  # a longer time between two pictures ends a shot: nothing is known of what moved there
+MIN_SHOT_S = 0.5  # shorter shots are left out: too little to track
+# A cut changes the picture by so much (grey levels, mean) and so many times more than its neighbours in time.
+CUT_LEVEL, CUT_RATIO, CUT_WINDOW_S = 1.5, 1.9, 0.28
+SAME_LEVEL = 1.0  # grey levels: no pixel of the thumbnail changes by more in a repeated picture
+
+U8 = NDArray[np.uint8]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The frames of a clip, as `frames.npz` holds them.
+
+    time: [T] s from the first picture. usable: [T]. reason: [T] index into `reasons`, 0 where usable.
+    segment: [T] number of the uninterrupted shot. box: [T, 4] left, top, right, bottom px of the main person's
+    face in the upright picture at full size, NaN where it is not seen.
+    """
+
+    time: F64
+    usable: Bool
+    reason: U8
+    reasons: tuple[str, ...]
+    segment: NDArray[np.int32]
+    box: F32
+
+
+def differences(thumbnails: U8) -> tuple[F64, Bool]:
+    """How each of [T, h, w] grey pictures differs from the one before: (mean [T], is it the same picture [T])."""
+    mean, same = np.zeros(len(thumbnails)), np.zeros(len(thumbnails), bool)
+    for i in range(1, len(thumbnails)):
+        change = np.abs(thumbnails[i].astype(np.int16) - thumbnails[i - 1])
+        mean[i], same[i] = change.mean(), change.max() <= SAME_LEVEL
+    return mean, same
+
+
+def find_shots(time: F64, change: F64) -> NDArray[np.int32]:
+    """Number [T] of the uninterrupted shot of each frame, after `change` [T] of `differences`."""
+    step = np.diff(time, prepend=time[0] - 1.0)
+    typical = float(np.median(step[1:])) if len(time) > 1 else 1.0
+    # Pictures that are further apart differ more without any cut.
+    rate = change / np.maximum(1.0, step / typical)
+    window = max(3, round(CUT_WINDOW_S / typical))
+    padded = np.pad(rate, window, mode="reflect" if len(rate) > window else "edge")
+    around = np.stack([padded[i : i + len(rate)] for i in range(2 * window + 1) if i != window])
+    # The second largest, so that two cuts near each other are both found.
+    usual = np.sort(around, axis=0)[-2] + 0.5
+    first = (step > MAX_GAP_S) | ((rate > CUT_LEVEL) & (rate > CUT_RATIO * usual))
+    first[0] = True
+    return (np.cumsum(first) - 1).astype(np.int32)
+
+
+def usable_seconds(frames: Frames) -> float:
+    """Time that usable frames cover, s. Frames left out inside a shot cost nothing when the gap is short."""
+    return float(covered(frames).sum())
+
+
+def covered(frames: Frames) -> F64:
+    """[T] s that each usable frame stands for: up to the next usable one of its shot, if that is near."""
+    seconds = np.zeros(len(frames.time))
+    index = np.flatnonzero(frames.usable)
+    if len(index) < 2:
+        return seconds
+    step = np.diff(frames.time[index])
+    near = (step <= MAX_GAP_S) & (np.diff(frames.segment[index]) == 0)
+    seconds[index] = np.median(np.diff(frames.time))
+    seconds[index[:-1]] = np.where(near, step, seconds[index[:-1]])
+    return seconds
