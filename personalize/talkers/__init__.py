@@ -1,0 +1,1 @@
+"""Synthetic talkers: made-up facial motion for known speech, with known truth."""
