@@ -52,3 +52,13 @@ _MIRRORED = """
 477 468 471 470 469 472
 """
 MIRRORED = np.array([int(word) for word in _MIRRORED.split()])
+
+LEFT_EYE = (263, 249, 390, 373, 374, 380, 381, 382, 362, 466, 388, 387, 386, 385, 384, 398)
+RIGHT_EYE = (33, 7, 163, 144, 145, 153, 154, 155, 133, 246, 161, 160, 159, 158, 157, 173)
+
+_FOREHEAD = (10, 109, 338, 67, 297, 103, 332, 151, 108, 337, 69, 299, 104, 333, 68, 298, 9, 8)
+_TEMPLES = (139, 368, 143, 372, 116, 345, 117, 346, 118, 347)
+_CHEEKS = (50, 280, 101, 330, 36, 266, 100, 329)
+_NOSE = (168, 6, 197, 195, 5, 4, 1, 19, 94, 2, 122, 351, 188, 412, 48, 278, 64, 294, 98, 327, 45, 275, 3, 248)
+# The part of the face that expressions move least; its hull lies above the mouth.
+UPPER_FACE = (*_FOREHEAD, *_TEMPLES, *_CHEEKS, *_NOSE)
