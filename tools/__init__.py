@@ -1,0 +1,1 @@
+"""Builders of the embedded assets, run as `python -m tools.NAME`."""
