@@ -66,19 +66,19 @@ def _vowel(jaw: float, **targets: float) -> Viseme:
     return Viseme({"jawOpen": jaw, **targets}, firm=1.0, soft=0.6)
 
 
-_OPEN = _vowel(0.36, mouthLowerDown=0.18, mouthUpperUp=0.08)
+_OPEN = _vowel(0.32, mouthLowerDown=0.18, mouthUpperUp=0.08)
 _SPREAD = _vowel(0.12, mouthStretch=0.30, mouthSmile=0.18, mouthLowerDown=0.26, mouthUpperUp=0.12)
-_ROUND = _vowel(0.10, mouthPucker=0.62, mouthFunnel=0.22)
+_ROUND = _vowel(0.08, mouthPucker=0.62, mouthFunnel=0.14)
 _MID = _vowel(0.24, mouthStretch=0.16, mouthLowerDown=0.22, mouthUpperUp=0.08)
-_BACK = _vowel(0.30, mouthFunnel=0.34, mouthPucker=0.18, mouthLowerDown=0.10)
-_BILABIAL = Viseme({"jawOpen": 0.10, "seal": 1.0, "mouthPress": 0.12}, firm=3.0, soft=0.25)
+_BACK = _vowel(0.26, mouthFunnel=0.26, mouthPucker=0.18, mouthLowerDown=0.10)
+_BILABIAL = Viseme({"jawOpen": 0.10, "seal": 1.0, "mouthPress": 0.06}, firm=3.0, soft=0.25)
 _LABIODENTAL = Viseme({"jawOpen": 0.08, "mouthRollLower": 0.45, "mouthUpperUp": 0.16}, firm=2.2, soft=0.3)
 _ALVEOLAR = Viseme({"jawOpen": 0.12, "mouthLowerDown": 0.16}, firm=0.9, soft=0.3)
 _SIBILANT = Viseme(
     {"jawOpen": 0.05, "mouthStretch": 0.16, "mouthLowerDown": 0.26, "mouthUpperUp": 0.12}, 1.5, 0.3
 )
 _PALATAL = Viseme(
-    {"jawOpen": 0.07, "mouthFunnel": 0.45, "mouthPucker": 0.16, "mouthShrugUpper": 0.12, "jawForward": 0.15},
+    {"jawOpen": 0.07, "mouthFunnel": 0.36, "mouthPucker": 0.16, "mouthShrugUpper": 0.12, "jawForward": 0.15},
     firm=1.5,
     soft=0.4,
 )
@@ -95,24 +95,24 @@ VISEMES: dict[str, tuple[Viseme, ...]] = {
     **dict.fromkeys(("SH", "ZH", "CH", "JH"), (_PALATAL,)),
     **dict.fromkeys(("K", "G", "NG"), (_VELAR,)),
     "L": (Viseme({"jawOpen": 0.19, "mouthLowerDown": 0.14}, firm=0.8, soft=0.25),),
-    "R": (Viseme({"jawOpen": 0.12, "mouthPucker": 0.28, "mouthFunnel": 0.24}, firm=1.0, soft=0.4),),
-    "W": (Viseme({"jawOpen": 0.07, "mouthPucker": 0.72, "mouthFunnel": 0.12}, firm=1.8, soft=0.5),),
+    "R": (Viseme({"jawOpen": 0.12, "mouthPucker": 0.30, "mouthFunnel": 0.16}, firm=1.0, soft=0.4),),
+    "W": (Viseme({"jawOpen": 0.07, "mouthPucker": 0.72, "mouthFunnel": 0.08}, firm=1.8, soft=0.5),),
     "Y": (Viseme({"jawOpen": 0.09, "mouthStretch": 0.24, "mouthSmile": 0.14}, firm=0.8, soft=0.4),),
     "HH": (Viseme({"jawOpen": 0.16}, firm=0.3, soft=0.05),),
     "AA": (_OPEN,),
-    "AE": (_vowel(0.34, mouthStretch=0.22, mouthLowerDown=0.28, mouthUpperUp=0.14, mouthSmile=0.06),),
+    "AE": (_vowel(0.30, mouthStretch=0.22, mouthLowerDown=0.28, mouthUpperUp=0.14, mouthSmile=0.06),),
     **dict.fromkeys(("AH", "AX"), (_vowel(0.22, mouthLowerDown=0.14, mouthUpperUp=0.05),)),
     "AO": (_BACK,),
     "AW": (_OPEN, _ROUND),
     "AY": (_OPEN, _SPREAD),
     "EH": (_MID,),
-    "ER": (_vowel(0.16, mouthPucker=0.24, mouthFunnel=0.26),),
+    "ER": (_vowel(0.16, mouthPucker=0.26, mouthFunnel=0.16),),
     "EY": (_MID, _SPREAD),
     "IH": (_vowel(0.17, mouthStretch=0.16, mouthSmile=0.08, mouthLowerDown=0.20, mouthUpperUp=0.06),),
     "IY": (_SPREAD,),
     "OW": (_BACK, _ROUND),
     "OY": (_BACK, _SPREAD),
-    "UH": (_vowel(0.16, mouthPucker=0.34, mouthFunnel=0.22),),
+    "UH": (_vowel(0.16, mouthPucker=0.36, mouthFunnel=0.14),),
     "UW": (_ROUND,),
     SILENCE: (Viseme({}, firm=0.0, soft=0.7),),
 }
