@@ -33,6 +33,7 @@ HELD_OUT_YAWS_DEG = (-15.0, 5.0, 30.0)
 SIZE, FOCAL, DISTANCE = 512, 1200.0, 0.75  # px, px, m
 FINE = 4  # the mesh is looked up on a grid this much finer than the picture
 
+TO_CAMERA = np.array([1, -1, -1], np.float32)  # head axes to OpenCV's, for a head seen from the front
 CENTRE = ((SIZE - 1) / 2, (SIZE - 1) / 2)
 
 # Points of the outline: the landmarker slides them over the skin as the head turns.
@@ -63,7 +64,7 @@ def look(head: HeadModel, count: int, yaws_deg: tuple[float, ...], seed: int) ->
             angles = [np.deg2rad(yaw), np.deg2rad(rng.uniform(-8, 8))]
             turn = Rotation.from_euler("yx", angles).as_matrix().astype(np.float32)
             vertices = head.vertices(identity, np.zeros(len(head.expression_basis))) @ turn.T
-            vertices = vertices * np.float32([1, -1, -1]) + np.float32([0, 0, DISTANCE])
+            vertices = vertices * TO_CAMERA + np.array([0, 0, DISTANCE], np.float32)
             picture = render(vertices, head.faces, tint, FOCAL, CENTRE, (SIZE, SIZE))
             faces = landmarker.detect(picture)
             if not faces:
@@ -151,8 +152,8 @@ def measure(head: HeadModel, views: list[View]) -> F64:
 def report(head: HeadModel, errors: F64) -> None:
     """Print the median of groups of landmarks."""
     kept = head.landmark_embedding.landmarks
-    groups = {
-        "all": kept,
+    groups: dict[str, tuple[int, ...]] = {
+        "all": tuple(kept),
         "inner lips": INNER_UPPER + INNER_LOWER,
         "outer lips": OUTER_LIPS,
         "eyes": LEFT_EYE + RIGHT_EYE,
@@ -161,7 +162,7 @@ def report(head: HeadModel, errors: F64) -> None:
     }
     print(f"{len(kept)} landmarks; held-out heads, {len(errors)} views:")
     for name, members in groups.items():
-        chosen = errors[:, np.isin(kept, members)]
+        chosen = errors[:, np.flatnonzero(np.isin(kept, members))]
         print(f"  {name}: median {np.median(chosen):.2f} mm, mean {chosen.mean():.2f} mm")
 
 

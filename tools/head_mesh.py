@@ -83,12 +83,12 @@ def _skin_quads(source: Source) -> I64:
     vertices = source.vertices
     quads = source.quads("body")
     y, z = vertices[:, 1], vertices[:, 2]
-    keep = (y > 5.95 - 0.45 * (z - 0.3)) & (y > 5.6)
+    keep = y > 5.9 - 0.35 * (z - 0.3)
     for group in EYES:
         ball = vertices[source.group(group)]
         centre = ball.mean(0)
         radius = np.linalg.norm(ball - centre, axis=1).mean()
-        keep &= (np.linalg.norm(vertices - centre, axis=1) > 1.17 * radius) | (z > centre[2])
+        keep &= (np.linalg.norm(vertices - centre, axis=1) > 1.17 * radius) | (z > centre[2] + 0.4 * radius)
     quads = quads[keep[quads].all(1)]
     # The plane also cuts the raised hands off: keep the piece with the highest vertex, the crown.
     a, b = quads.ravel(), np.roll(quads, 1, axis=1).ravel()

@@ -105,7 +105,7 @@ class Source:
         y = (1 - place[:, 1:]) * (picture.shape[0] - 1)
         values = cv2.remap(picture, x, y, cv2.INTER_LINEAR)[:, 0] / 255.0
         values[~np.isin(np.arange(len(values)), corners[body])] = 0
-        return values
+        return (values + values[self.mirror]) / 2
 
     def slider_names(self, groups: tuple[str, ...]) -> list[str]:
         """Names `group/slider` of all sliders of some groups, sorted."""
