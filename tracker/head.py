@@ -90,7 +90,7 @@ class HeadModel:
         then right. Leading dimensions broadcast. jaw, neck: [.., 3]; this head moves its jaw by expressions and its
         neck with the head, so anything but zero raises TrackError.
         """
-        return self._positions(np.arange(len(self.template)), identity, expression, jaw, neck, eyes)
+        return self._positions(slice(None), identity, expression, jaw, neck, eyes)
 
     def landmark_positions(
         self,
@@ -114,7 +114,7 @@ class HeadModel:
 
     def _positions(
         self,
-        select: NDArray[np.integer],
+        select: NDArray[np.integer] | slice,
         identity: ArrayLike,
         expression: ArrayLike,
         jaw: ArrayLike | None,
@@ -133,22 +133,19 @@ class HeadModel:
             return vertices
         turns = np.asarray(eyes, np.float32)
         for side, name in enumerate(("left_eye", "right_eye")):
-            vertices = self._turn(vertices, select, self.joints[name], who, turns[..., side, :])
+            member = np.isin(np.arange(len(self.template))[select], self.joints[name].vertices)
+            vertices = _turn(vertices, member, self.joints[name], who, turns[..., side, :])
         return vertices
 
-    def _turn(
-        self, vertices: F32, select: NDArray[np.integer], joint: Joint, identity: F32, turn: F32
-    ) -> F32:
-        """Turn the joint's vertices about its centre by an axis-angle rotation [.., 3]."""
-        member = np.isin(select, joint.vertices)
-        lead = np.broadcast_shapes(vertices.shape[:-2], turn.shape[:-1])
-        vertices = np.broadcast_to(vertices, (*lead, *vertices.shape[-2:])).copy()
-        centre = (joint.position + identity @ joint.identity_basis)[..., None, :]
-        matrix = (
-            Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*turn.shape, 3).astype(np.float32)
-        )
-        vertices[..., member, :] = (vertices[..., member, :] - centre) @ np.swapaxes(matrix, -1, -2) + centre
-        return vertices
+
+def _turn(vertices: F32, member: NDArray[np.bool_], joint: Joint, identity: F32, turn: F32) -> F32:
+    """Turn some vertices about the joint's centre by an axis-angle rotation [.., 3]."""
+    lead = np.broadcast_shapes(vertices.shape[:-2], turn.shape[:-1])
+    vertices = np.broadcast_to(vertices, (*lead, *vertices.shape[-2:])).copy()
+    centre = (joint.position + identity @ joint.identity_basis)[..., None, :]
+    matrix = Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix().reshape(*turn.shape, 3).astype(np.float32)
+    vertices[..., member, :] = (vertices[..., member, :] - centre) @ np.swapaxes(matrix, -1, -2) + centre
+    return vertices
 
 
 def _combine(weights: F32, basis: F32) -> F32:
