@@ -14,8 +14,8 @@ from kornia.geometry import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import from_numpy
-from tracker.head import HeadModel
 
+from tracker.head import HeadModel
 from tracker.track import F64, Track
 
 
@@ -53,7 +53,7 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
     face, lips = head.regions["face"], head.regions["lips"]
     scale, turn, shift = _align(neutral, face, track, fitted, truth)
     aligned = scale * neutral @ turn.T + shift
-    surface, _ = cKDTree(aligned[face]).query(truth.neutral)
+    surface, _ = cKDTree(truth.neutral).query(aligned[face])
     near = surface < np.quantile(surface, 0.95)  # the two heads do not end at the same rim
     _, partner = cKDTree(truth.neutral).query(aligned[lips])
     seen = np.flatnonzero(track.valid)
@@ -98,9 +98,15 @@ def _align(
     tree = cKDTree(truth.neutral)
     source = neutral[face]
     for _ in range(40):
-        distance, partner = tree.query(scale * source @ turn.T + shift)
-        keep = distance < np.quantile(distance, 0.8)
-        scale, turn, shift = similarity(source[keep], truth.neutral[partner[keep]])
+        # Both ways: nearest points from one side alone let the scale collapse.
+        aligned = scale * source @ turn.T + shift
+        there, partner = tree.query(aligned)
+        back, origin = cKDTree(aligned).query(truth.neutral)
+        near, found = there < np.quantile(there, 0.8), back < np.quantile(back, 0.8)
+        scale, turn, shift = similarity(
+            np.concatenate([source[near], source[origin[found]]]),
+            np.concatenate([truth.neutral[partner[near]], truth.neutral[found]]),
+        )
     return scale, turn, shift
 
 

@@ -46,7 +46,7 @@ class Weights:
     """Standard deviation of one landmark, embedding bias included."""
     pair_noise_mm: float = 0.4
     """Standard deviation of an opening between paired lip or lid landmarks, which err together."""
-    robust: float = 3.0
+    robust: float = 6.0
     """Cauchy scale, in standard deviations: residuals beyond it count ever less."""
     evidence: float = 0.1
     """Share of the landmarks that err independently; neighbours err together."""
@@ -227,17 +227,19 @@ class Energy:
         slope = self._projection_slope(camera)
         rotation = rotation_matrix(x[:, -6:-3])
         directions = np.einsum("nlik,nkj->nlij", slope, rotation)
-        jacobian = np.empty((count, len(model.mean), 2, len(moves) + POSE))
-        np.matmul(directions, moves.transpose(1, 2, 0), out=jacobian[..., :-POSE])
+        # Single precision from here: it halves the time of the fit, and residuals stay in double.
+        jacobian = np.empty((count, len(model.mean), 2, len(moves) + POSE), np.float32)
+        columns = moves.transpose(1, 2, 0).astype(np.float32)
+        np.matmul(directions.astype(np.float32), columns, out=jacobian[..., :-POSE])
         swing = np.cross(turned[:, :, None, :], slope)
         jacobian[..., -6:-3] = np.einsum("nlik,nkj->nlij", swing, left_jacobian(x[:, -6:-3]))
         jacobian[..., -3:] = slope
         rows = self._with_pairs(jacobian)
-        rows *= (np.sqrt(weight) * scale)[..., None, None]
+        rows *= (np.sqrt(weight) * scale).astype(np.float32)[..., None, None]
         rows = rows.reshape(count, -1, rows.shape[-1])
-        weighted = (residual * np.sqrt(weight)[..., None]).reshape(count, -1)
-        gradient = np.einsum("nrp,nr->np", rows, weighted)
-        hessian = rows.transpose(0, 2, 1) @ rows
+        weighted = (residual * np.sqrt(weight)[..., None]).reshape(count, -1, 1)
+        gradient = (rows.transpose(0, 2, 1) @ weighted.astype(np.float32))[..., 0].astype(np.float64)
+        hessian = (rows.transpose(0, 2, 1) @ rows).astype(np.float64)
         prior, slope_w, curve = self._prior(x)
         w = np.arange(-POSE - model.expressions, -POSE)
         gradient[:, w] += slope_w

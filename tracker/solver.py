@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,11 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from tracker.energy import POSE, Energy, Quadratic
 from tracker.track import F64
 
+ROUNDS = 4  # of fixing what passes a bound
+GIVE_UP = 1e6  # damping at which no step can help
 CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
 Progress = Callable[[int, int], None]
+Step = tuple[F64, F64]  # of the identity [Ki] and of the frames [n, P]
 
 
 def clamp(x: F64) -> F64:
@@ -40,6 +44,25 @@ def freeze(gradient: F64, hessian: F64, fixed: NDArray[np.bool_]) -> tuple[F64, 
     return gradient * free, hessian
 
 
+def bounded_step(x: F64, gradient: F64, solve: Callable[[NDArray[np.bool_], F64], Step]) -> Step:
+    """The step of `solve` whose weights stay in 0..1.
+
+    `solve(fixed, move)` minimizes the quadratic model with the fixed unknowns displaced by `move`. What passes a bound
+    is moved onto it and the rest solved again: cutting the step alone would leave the rest tuned to the uncut one.
+    """
+    fixed, move = held(x, gradient), np.zeros_like(x)
+    step = solve(fixed, move)
+    for _ in range(ROUNDS):
+        inside = clamp(x + step[1]) - x
+        out = (np.abs(inside - step[1]) > 1e-12) & ~fixed
+        if not out.any():
+            break
+        fixed = fixed | out
+        move = np.where(out, inside, move)
+        step = solve(fixed, move)
+    return step
+
+
 @dataclass(frozen=True)
 class Solution:
     """identity [Ki]; x [n, P]; value: the energy; steps: accepted ones."""
@@ -62,14 +85,16 @@ def solve_subject(
     damping, value, done = 1e-3, total(identity, x), 0
     for _ in range(steps):
         quadratic = energy.linearize(energy.shape(identity), x, with_identity=True)
-        step_identity, step = schur_step(quadratic, identity, x, prior, damping)
-        trial_identity, trial = identity + step_identity, clamp(x + step)
-        trial_value = total(trial_identity, trial)
-        if trial_value >= value:
-            damping *= 10
-            if damping > 1e6:
+        while True:
+            solve = partial(schur_step, quadratic, identity, prior, damping)
+            step_identity, step = bounded_step(x, quadratic.gradient[:, len(identity) :], solve)
+            trial_identity, trial = identity + step_identity, clamp(x + step)
+            trial_value = total(trial_identity, trial)
+            if trial_value < value or damping > GIVE_UP:
                 break
-            continue
+            damping *= 10
+        if trial_value >= value:
+            break
         gain, value = value - trial_value, trial_value
         identity, x, damping, done = trial_identity, trial, max(damping / 5, 1e-6), done + 1
         if gain < tolerance * value:
@@ -77,11 +102,13 @@ def solve_subject(
     return Solution(identity, x, value, done)
 
 
-def schur_step(quadratic: Quadratic, identity: F64, x: F64, prior: float, damping: float) -> tuple[F64, F64]:
-    """Step of the identity [Ki] and of the frames [n, P]."""
+def schur_step(
+    quadratic: Quadratic, identity: F64, prior: float, damping: float, fixed: NDArray[np.bool_], move: F64
+) -> Step:
+    """Step of identity and frames, per-frame blocks eliminated; the fixed unknowns are displaced by `move`."""
     k = len(identity)
-    fixed = held(x, quadratic.gradient[:, k:])
-    gradient, block = freeze(quadratic.gradient[:, k:], quadratic.hessian[:, k:, k:], fixed)
+    shifted = quadratic.gradient + np.einsum("npq,nq->np", quadratic.hessian[:, :, k:], move)
+    gradient, block = freeze(shifted[:, k:], quadratic.hessian[:, k:, k:], fixed)
     cross = quadratic.hessian[:, :k, k:] * ~fixed[:, None]
     index = np.arange(block.shape[1])
     block[:, index, index] *= 1 + damping
@@ -89,11 +116,9 @@ def schur_step(quadratic: Quadratic, identity: F64, x: F64, prior: float, dampin
     shared = quadratic.hessian[:, :k, :k].sum(0) + prior * np.eye(k)
     shared[np.arange(k), np.arange(k)] *= 1 + damping
     shared -= np.einsum("nkp,npj->kj", cross, solved[..., :k])
-    right = -(quadratic.gradient[:, :k].sum(0) + prior * identity) + np.einsum(
-        "nkp,np->k", cross, solved[..., k]
-    )
+    right = np.einsum("nkp,np->k", cross, solved[..., k]) - shifted[:, :k].sum(0) - prior * identity
     step_identity = np.linalg.solve(shared, right)
-    return step_identity, -solved[..., k] - solved[..., :k] @ step_identity
+    return step_identity, move - solved[..., k] - solved[..., :k] @ step_identity
 
 
 @dataclass(frozen=True)
@@ -153,11 +178,11 @@ def solve_frames(
     for step in range(steps):
         gradient, hessian = _linearize(energy, shape, x)
         gradient += smoothness.gradient(x)
-        fixed = held(x, gradient)
         while True:
-            trial = clamp(x + band_step(gradient, hessian, fixed, smoothness, damping))
+            solve = partial(band_step, gradient, hessian, smoothness, damping)
+            trial = clamp(x + bounded_step(x, gradient, solve)[1])
             trial_value = total(trial)
-            if trial_value < value or damping > 1e6:
+            if trial_value < value or damping > GIVE_UP:
                 break
             damping *= 10
         if progress:
@@ -183,10 +208,11 @@ def _linearize(energy: Energy, shape: F64, x: F64) -> tuple[F64, F64]:
 
 
 def band_step(
-    gradient: F64, hessian: F64, fixed: NDArray[np.bool_], smoothness: Smoothness, damping: float
-) -> F64:
-    """Solve the block-pentadiagonal system by a banded Cholesky factorization; step [n, P]."""
+    gradient: F64, hessian: F64, smoothness: Smoothness, damping: float, fixed: NDArray[np.bool_], move: F64
+) -> Step:
+    """Step of the frames (no identity) by banded Cholesky factorization; the fixed unknowns are displaced by `move`."""
     n, p = gradient.shape
+    gradient = gradient + np.einsum("npq,nq->np", hessian, move) + smoothness.gradient(move)
     gradient, hessian = freeze(gradient, hessian, fixed)
     free = ~fixed
     diagonal, first, second = smoothness.bands(n)
@@ -202,4 +228,5 @@ def band_step(
     factor = cholesky_banded(
         band.reshape(2 * p + 1, n * p), lower=True, overwrite_ab=True, check_finite=False
     )
-    return cho_solve_banded((factor, True), -gradient.ravel(), check_finite=False).reshape(n, p)
+    step = cho_solve_banded((factor, True), -gradient.ravel(), check_finite=False).reshape(n, p)
+    return np.zeros(0), move + step

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tracker.energy import POSE, Quadratic
-from tracker.solver import Smoothness, band_step, clamp, held, schur_step
+from tracker.solver import Smoothness, band_step, bounded_step, clamp, held, schur_step
 
 FRAMES, WEIGHTS, IDENTITIES = 7, 3, 4
 UNKNOWNS = WEIGHTS + POSE
@@ -50,11 +50,12 @@ def test_band_step_solves_the_dense_system(rng, run):
         part = slice(frame * UNKNOWNS, (frame + 1) * UNKNOWNS)
         dense[part, part] += blocks[frame]
     expected = -np.linalg.solve(dense, gradient.ravel()).reshape(FRAMES, UNKNOWNS)
-    fixed = np.zeros((FRAMES, UNKNOWNS), bool)
-    np.testing.assert_allclose(band_step(gradient, blocks, fixed, term, 0.0), expected, rtol=1e-6, atol=1e-8)
+    none, still = np.zeros((FRAMES, UNKNOWNS), bool), np.zeros((FRAMES, UNKNOWNS))
+    step = band_step(gradient, blocks, term, 0.0, none, still)[1]
+    np.testing.assert_allclose(step, expected, rtol=1e-6, atol=1e-8)
 
 
-def test_band_step_leaves_fixed_unknowns_and_solves_for_the_rest(rng):
+def test_band_step_moves_fixed_unknowns_as_told_and_solves_for_the_rest(rng):
     term, dense = smoothness(rng, np.zeros(FRAMES, int))
     gradient, blocks = rng.normal(size=(FRAMES, UNKNOWNS)), random_blocks(rng, UNKNOWNS)
     for frame in range(FRAMES):
@@ -62,16 +63,19 @@ def test_band_step_leaves_fixed_unknowns_and_solves_for_the_rest(rng):
         dense[part, part] += blocks[frame]
     fixed = rng.random((FRAMES, UNKNOWNS)) < 0.3
     free = ~fixed.ravel()
-    step = band_step(gradient, blocks, fixed, term, 0.0)
-    assert (step[fixed] == 0).all()
-    expected = -np.linalg.solve(dense[np.ix_(free, free)], gradient.ravel()[free])
+    move = rng.normal(size=fixed.shape) * fixed
+    step = band_step(gradient, blocks, term, 0.0, fixed, move)[1]
+    np.testing.assert_array_equal(step[fixed], move[fixed])
+    pull = (gradient.ravel() + dense @ move.ravel())[free]
+    expected = -np.linalg.solve(dense[np.ix_(free, free)], pull)
     np.testing.assert_allclose(step.ravel()[free], expected, rtol=1e-6, atol=1e-8)
 
 
 def test_schur_step_solves_the_dense_system(rng):
     size = IDENTITIES + UNKNOWNS
     quadratic = Quadratic(np.zeros(FRAMES), rng.normal(size=(FRAMES, size)), random_blocks(rng, size))
-    identity, x, prior = rng.normal(size=IDENTITIES), np.full((FRAMES, UNKNOWNS), 0.5), 2.0
+    identity, prior = rng.normal(size=IDENTITIES), 2.0
+    none, still = np.zeros((FRAMES, UNKNOWNS), bool), np.zeros((FRAMES, UNKNOWNS))
     dense = np.zeros((IDENTITIES + FRAMES * UNKNOWNS,) * 2)
     right = np.zeros(len(dense))
     dense[:IDENTITIES, :IDENTITIES] = prior * np.eye(IDENTITIES)
@@ -82,7 +86,7 @@ def test_schur_step_solves_the_dense_system(rng):
         dense[np.ix_(index, index)] += quadratic.hessian[frame]
         right[index] -= quadratic.gradient[frame]
     expected = np.linalg.solve(dense, right)
-    step_identity, step = schur_step(quadratic, identity, x, prior, 0.0)
+    step_identity, step = schur_step(quadratic, identity, prior, 0.0, none, still)
     np.testing.assert_allclose(step_identity, expected[:IDENTITIES], rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(step.ravel(), expected[IDENTITIES:], rtol=1e-6, atol=1e-8)
 
@@ -94,6 +98,21 @@ def test_weights_at_a_bound_are_held_only_when_pushed_out():
     np.testing.assert_array_equal(held(x, inward)[0, :3], [True, False, False])
     np.testing.assert_array_equal(held(x, outward)[0, :3], [False, True, False])
     assert not held(x, inward)[0, 3:].any()
+
+
+def test_bounded_step_finds_the_bounded_minimum():
+    # Two coupled weights; the unbounded minimum (2, 0.2) is outside, the bounded one is (1, 0.7).
+    hessian = np.array([[2.0, 1.0], [1.0, 2.0]])
+    x = np.full((1, 2 + POSE), 0.5)
+
+    def solve(fixed, move):
+        step, free = move.copy(), np.flatnonzero(~fixed[0, :2])
+        pull = hessian @ (x[0, :2] - [2.0, 0.2]) + hessian @ move[0, :2]
+        step[0, free] = -np.linalg.solve(hessian[np.ix_(free, free)], pull[free])
+        return np.zeros(0), step
+
+    step = bounded_step(x, np.zeros_like(x), solve)[1]
+    np.testing.assert_allclose((x + step)[0, :2], [1.0, 0.7])
 
 
 def test_clamp_cuts_weights_and_not_the_pose():
