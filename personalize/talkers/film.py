@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from personalize.media import VideoWriter, read_audio
 from personalize.talkers.motion import TalkerMotion, talker_motion
-from personalize.talkers.skin import backdrop, skin_block, texture
+from personalize.talkers.skin import backdrop, painted, seen_faces, skin_block, texture
 from personalize.talkers.style import Style
 from personalize.talkers.visemes import load_phones
 from tracker.head import HeadModel
@@ -148,7 +148,7 @@ class _Studio:
 
     def __init__(self, head: HeadModel, neutral: F32, size: tuple[int, int], focal: float, seed: int) -> None:
         self._random = np.random.default_rng((seed, 5))
-        self._faces, self._albedo, self._places = head.faces, head.albedo, neutral
+        self._faces, self._albedo, self._places = seen_faces(head), painted(head), neutral
         self._block = skin_block(seed)
         self._size = size
         self._large = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)

@@ -80,6 +80,6 @@ def seal(phones: Sequence[Phone], times: F64) -> F64:
             start = phone.start
             # The last quarter of a stop is its burst.
             end = max(phone.end - 0.25 * (phone.end - phone.start), start + SHORTEST_SEAL_S)
-            hold = np.where(times < start, bump(times, start, 0.07, 1), bump(times, end, 1, 0.06))
+            hold = np.where(times < start, bump(times, start, 0.10, 1), bump(times, end, 1, 0.09))
             shut = np.maximum(shut, np.where((times >= start) & (times <= end), 1.0, hold))
     return shut
