@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from tracker.head import load_head
 
 from personalize.files import write_atomic
 from personalize.media import VideoWriter, on_video_clock, read_audio, read_frames
 from personalize.quality import frame_reason
 from personalize.run import RunFolder, read_landmarks, read_track
 from personalize.run import read_frames as read_frame_table
-from tracker.head import load_head
 from tracker.overlay import contact_sheet, draw_overlay, panel_size
 
 PREVIEW_WIDTH, PREVIEW_CRF, PREVIEW_S = 720, 30, 60.0

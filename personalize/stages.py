@@ -6,6 +6,8 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from tracker.camera import estimate_camera
+from tracker.head import load_head
 
 from model.checkpoint import BASE_CHECKPOINT
 from model.speech import load_encoder
@@ -21,9 +23,7 @@ from personalize.quality import write_quality
 from personalize.registration import register_run
 from personalize.settings import Settings
 from personalize.stage import VIDEO, Context, Stage
-from tracker.camera import estimate_camera
 from tracker.fit import fit_track
-from tracker.head import load_head
 from tracker.landmarker import LANDMARKER_FILE, track_landmarks
 
 

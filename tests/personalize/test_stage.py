@@ -1,5 +1,6 @@
 """Stages: cached by content, remade when anything that decides them changes, whole or not there."""
 
+import io
 import json
 import multiprocessing
 import os
@@ -62,7 +63,7 @@ def context(tmp_path: Path) -> Context:
     run.path.mkdir()
     run.begin(Settings())
     Count.made = Double.made = 0
-    return Context(run, Settings(), Reporter(stream=(tmp_path / "said.txt").open("w")))
+    return Context(run, Settings(), Reporter(stream=io.StringIO()))
 
 
 STAGES = (Count(), Double())
@@ -123,7 +124,7 @@ def test_a_failing_stage_leaves_the_earlier_result(context: Context, monkeypatch
 
 def _crawl(path: Path) -> None:
     run = RunFolder.open(path)
-    run_stages((Crawl(),), Context(run, Settings(), Reporter(stream=open(os.devnull, "w"))))
+    run_stages((Crawl(),), Context(run, Settings(), Reporter(stream=io.StringIO())))
 
 
 def test_killed_stage_is_not_taken_for_finished_and_continues(context: Context) -> None:
@@ -142,9 +143,13 @@ def test_killed_stage_is_not_taken_for_finished_and_continues(context: Context) 
 
 
 def test_another_process_is_refused(context: Context) -> None:
-    with context.run.locked(), pytest.raises(UserError, match="another personalize is working there"):
-        with RunFolder.open(context.run.path).locked():
-            pass
+    other = RunFolder.open(context.run.path)
+    with (
+        context.run.locked(),
+        pytest.raises(UserError, match="another personalize is working there"),
+        other.locked(),
+    ):
+        pass
 
 
 def test_another_videos_folder_is_refused(context: Context, tmp_path: Path) -> None:

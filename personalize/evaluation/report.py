@@ -1,0 +1,104 @@
+"""report.html: self-contained, opens offline."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from personalize.evaluation import charts
+from personalize.evaluation.evaluate import SYSTEMS, Evaluation
+from personalize.files import write_text
+from personalize.overlay import PREVIEW_S
+from personalize.quality import frame_reason
+from personalize.run import RunFolder, read_camera, read_frames, read_track, tool_version
+
+# Metric of metrics.json -> name and meaning in the table.
+COLUMNS = {
+    "lip_sync": "lip opening after time warping, mm",
+    "lip_max": "largest lip-vertex error of a frame, mm",
+    "l2_lip": "mean lip-vertex error, mm",
+    "l2_face": "mean face-vertex error, mm",
+    "lip_gap_r": "correlation of the lip opening (higher is better)",
+    "closure": "share of lip closures reached (higher is better)",
+    "div_e": "difference between samples, mm",
+}
+
+
+def write_report(run: RunFolder, evaluation: Evaluation, folder: Path) -> None:
+    """Write `folder`/report.html from the run's files and the evaluation."""
+    track = read_track(run.path / "refine/track.npz")
+    frames = read_frames(run.path / "ingest/frames.npz")
+    guidance = run.read_json("finetune/guidance.json")
+    media = run.read_json("ingest/media.json")
+    environment = Environment(
+        loader=PackageLoader("personalize.evaluation", "."), autoescape=True, undefined=StrictUndefined
+    )
+    metrics = evaluation.metrics
+    duration = float(track.time[-1])
+    reasons = [frame_reason(frames, track, frame) for frame in np.flatnonzero(~track.valid)]
+    page = environment.get_template("report.html").render(
+        video=run.video.name,
+        version=tool_version(),
+        when=time.strftime("%Y-%m-%d %H:%M"),
+        warnings=media["warnings"],
+        cards=_cards(metrics["systems"], duration, float(track.valid.mean())),
+        overlay=_data_url(run.path / "overlay/preview.mp4", "video/mp4"),
+        overlay_cut=round(PREVIEW_S) if duration > PREVIEW_S else 0,
+        timeline=charts.timeline(track.time, track.confidence, track.valid),
+        reasons=", ".join(f"{reasons.count(name)} {name}" for name in sorted(set(reasons))),
+        contact_sheet=_data_url(run.path / "overlay/contact_sheet.png", "image/png"),
+        clip=_data_url(folder / "samples/test.mp4", "video/mp4"),
+        lip_opening=charts.lip_opening(evaluation.clip_time, evaluation.reference, evaluation.samples),
+        guidance=metrics["guidance"],
+        seconds=metrics["seconds"],
+        columns=[{"name": name, "meaning": meaning} for name, meaning in COLUMNS.items()],
+        rows=[
+            {"name": name, "values": [f"{metrics['systems'][name][column]:.2f}" for column in COLUMNS]}
+            for name in SYSTEMS
+        ],
+        guidance_curve=charts.guidance_curve(guidance["sweep"], guidance["chosen"]),
+        loss=charts.loss_curve(*_loss(run.path / "finetune/log.csv")),
+        facts=_facts(run, media),
+    )
+    write_text(folder / "report.html", page)
+
+
+def _cards(systems: dict[str, dict[str, float]], duration: float, tracked: float) -> list[dict[str, str]]:
+    ours, base = systems["personalized"], systems["base"]
+    return [
+        {"value": f"{duration:.0f} s", "label": "of video"},
+        {"value": f"{tracked:.0%}", "label": "of frames tracked"},
+        {"value": f"{ours['lip_sync']:.2f} mm", "label": f"lip_sync (base {base['lip_sync']:.2f})"},
+        {"value": f"{ours['l2_lip']:.2f} mm", "label": f"lip error (base {base['l2_lip']:.2f})"},
+        {"value": f"{ours['lip_gap_r']:.2f}", "label": "correlation of lip opening"},
+    ]
+
+
+def _loss(path: Path) -> tuple[list[float], list[float]]:
+    with path.open(newline="", encoding="utf-8") as stream:
+        rows = [(float(row["step"]), float(row["loss"])) for row in csv.DictReader(stream)]
+    return [step for step, _ in rows], [loss for _, loss in rows]
+
+
+def _facts(run: RunFolder, media: dict[str, Any]) -> list[dict[str, str]]:
+    camera, _ = read_camera(run.path / "camera")
+    registration = run.read_json("registration/registration.json")
+    sure = "corrected" if registration["av_offset_sure"] else "not sure, left as it is"
+    focal = f"{camera.focal_px:.0f} px ± {camera.focal_sd_log * 100:.0f} % ({camera.method}; {camera.prior})"
+    facts = {
+        "video": f"{media['width']}x{media['height']}, {media['fps']:.2f} frames/s, {media['video_codec']}",
+        "focal length": focal,
+        "sound offset": f"{registration['av_offset_estimate_s'] * 1000:+.0f} ms ({sure})",
+        "stages": ", ".join(f"{name} {entry['seconds']:.0f} s" for name, entry in run.stages.items()),
+    }
+    return [{"name": name, "value": value} for name, value in facts.items()]
+
+
+def _data_url(path: Path, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"

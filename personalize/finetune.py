@@ -1,0 +1,58 @@
+"""Fine-tuning stage: the base model learns one person's motion; checkpoint and guidance are chosen on validation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from model.checkpoint import Checkpoint
+from model.finetuning import choose_checkpoint, subject_of, sweep_guidance
+from model.speech import load_encoder
+from model.trainer import Trainer, TrainingConfig
+from personalize.errors import UserError
+from personalize.files import sha256_file, write_json
+from personalize.reporter import Reporter
+from personalize.run import RunFolder, tool_version
+from personalize.settings import Settings
+from personalize.subject_data import BASE_CHECKPOINT, load_subject_data
+
+
+def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Reporter) -> None:
+    """Write checkpoint.safetensors, log.csv, guidance.json and tensorboard/ into `folder`, continuing what is there.
+
+    Raises UserError when the clip holds too little speech with a tracked face in one of the parts of its split.
+    """
+    base = Checkpoint.load(BASE_CHECKPOINT, encoder=load_encoder().name)
+    data = load_subject_data(run, style=len(base.styles))
+    for part in ("train", "val", "test"):
+        if not data.parts[part]:
+            raise UserError(
+                f"{run.video}: no second of tracked face in the {part} part of the clip; "
+                "look at overlay.mp4, and film a longer clip"
+            )
+    provenance = {
+        "tool": "personalize",
+        "version": tool_version(),
+        "base": sha256_file(BASE_CHECKPOINT),
+        "video": run.video_sha256,
+        "iterations": settings.iterations,
+        "seed": settings.seed,
+    }
+    subject = subject_of(base, run.video.stem, data.sequences("train"), provenance)
+    subject = subject.with_weights(subject.network, subject.ema, template=data.motion.template)
+    work = folder / "steps"
+    trainer = Trainer(
+        subject,
+        data.sequences("train"),
+        work,
+        TrainingConfig(iterations=settings.iterations, seed=settings.seed),
+        tensorboard=folder / "tensorboard",
+    )
+    candidates = trainer.train(report.progress)
+    report.say("choosing the checkpoint and the guidance scale on the validation split")
+    best, errors = choose_checkpoint(candidates, data.sequences("val"), settings.seed)
+    sweep, chosen = sweep_guidance(best, data.sequences("val"), settings.seed, report.progress)
+    s = settings.guidance if settings.guidance is not None else chosen
+    best.with_weights(best.network, best.ema, guidance=s).save(folder / "checkpoint.safetensors")
+    choice = {"lip_error_mm": dict(zip([path.stem for path in candidates], errors))}
+    write_json(folder / "guidance.json", {"sweep": sweep, "chosen": chosen, "used": s, "candidates": choice})
+    (work / "log.csv").replace(folder / "log.csv")
