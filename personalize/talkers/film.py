@@ -161,9 +161,15 @@ class _Studio:
     def shoot(self, vertices: F32) -> U8:
         """A picture [H, W, 3] u8 of posed vertices [D, 3] m in the camera frame."""
         pixels = np.concatenate([project(vertices, self._focal, self._principal), vertices[:, 2:]], axis=1)
-        raster = rasterize(pixels, self._faces, self._large)
-        picture = shade(raster, self._faces, vertices, self._albedo, self._backdrop, LIGHT, AMBIENT)
-        texture(picture, raster, self._faces, self._places, self._block)
+        # Only the rectangle around the head is worked on.
+        left, top = np.clip(np.floor(pixels[:, :2].min(axis=0)), 0, self._large).astype(int)
+        right, bottom = np.clip(np.ceil(pixels[:, :2].max(axis=0)) + 1, 0, self._large).astype(int)
+        pixels[:, :2] -= (left, top)
+        picture = self._backdrop.copy()
+        around = picture[top:bottom, left:right]
+        raster = rasterize(pixels, self._faces, (right - left, bottom - top))
+        around[:] = shade(raster, self._faces, vertices, self._albedo, around, LIGHT, AMBIENT)
+        texture(around, raster, self._faces, self._places, self._block)
         picture = cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA)
         blurred = cv2.GaussianBlur(picture, (0, 0), BLUR_PX).astype(np.float32)
         shift = self._random.integers(0, self._size[0])
