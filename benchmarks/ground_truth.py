@@ -69,6 +69,7 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
         "lip_motion_mm": float(np.linalg.norm(error, axis=-1).mean()),
         "lip_in_plane_mm": float(np.linalg.norm(error[..., :2], axis=-1).mean()),
         "lip_depth_mm": float(np.abs(error[..., 2]).mean()),
+        "lip_offset_mm": float(np.linalg.norm((moved - true).mean(0), axis=-1).mean()),
         "lip_motion_truth": float(np.linalg.norm(true - true.mean(0), axis=-1).mean()),
         "opening_r": float(np.corrcoef(gap, true_gap)[0, 1]),
         "opening_rmse_mm": float(np.sqrt(np.mean((gap - true_gap) ** 2))),

@@ -48,19 +48,19 @@ class Weights:
     """Standard deviation of an opening between paired lip or lid landmarks, which err together."""
     robust: float = 6.0
     """Cauchy scale, in standard deviations: residuals beyond it count ever less."""
-    evidence: float = 0.1
+    evidence: float = 0.2
     """Share of the landmarks that err independently; neighbours err together."""
-    identity: float = 4.0
+    identity: float = 2.0
     """Inverse variance of an identity coefficient, per key frame: a static bias repeats in every frame."""
-    expression_mean: float = 0.15
+    expression_mean: float = 0.5
     """Mean of the exponential prior on an expression weight."""
     ambiguous_mean: float = 0.02
     """The same for shapes that trade depth or side shift against pose, or that landmarks cannot see."""
     expression_sd: float = 0.5
     """Standard deviation of the Gaussian prior on an expression weight."""
-    rest: float = 8.0
+    rest: float = 30.0
     """Factor on the expression prior in frames at rest: identity, not expression, explains them."""
-    acceleration: tuple[float, float, float] = (0.2, 0.01, 0.002)
+    acceleration: tuple[float, float, float] = (0.2, 0.005, 0.001)
     """Standard deviation of the second difference at 25 fps: weights, rotation (rad), translation (m)."""
 
 

@@ -24,7 +24,8 @@ def eye_rotations(
     """[n, 2, 3] rad, left then right: the turn that carries the head's straight iris onto the seen one.
 
     observed: [n, 478, 2] px. Yaw turns about y and pitch about x of the head; no roll. Zero if the head's
-    landmark embedding has no irises.
+    landmark embedding has no irises. That the eyes differ in the clip's median is the head's error rather than a
+    squint: both take the mean of their medians.
     """
     at = [np.flatnonzero(head.landmark_embedding.landmarks == index) for index in IRIS_CENTRES]
     out = np.zeros((len(x), 2, 3))
@@ -40,7 +41,7 @@ def eye_rotations(
     moved = shift @ matrix / EYE_RADIUS_M  # back to head axes
     out[..., 1] = np.arcsin(np.clip(moved[..., 0], -np.sin(LIMIT), np.sin(LIMIT)))
     out[..., 0] = -np.arcsin(np.clip(moved[..., 1], -np.sin(LIMIT), np.sin(LIMIT)))
-    return out
+    return out - np.median(out, axis=0) + np.median(out, axis=0).mean(0)
 
 
 def _embedded(

@@ -192,6 +192,8 @@ def solve_frames(
         gain, value, x, damping = value - trial_value, trial_value, trial, max(damping / 5, 1e-6)
         if gain < tolerance * value:
             break
+    if progress:
+        progress(steps, steps)
     return x, value
 
 

@@ -1,0 +1,243 @@
+"""Closed loop: known parameters -> projected landmarks and noise -> fit -> error."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tracker.fit import fit_track
+from tracker.head import load_head
+from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
+from tracker.track import Bundle, Camera, Landmarks, TrackError
+
+HEAD = load_head()
+NAMES = list(HEAD.expression_names)
+SIZE, FOCAL, DISTANCE = (1280, 720), 1500.0, 0.65
+CAMERA = Camera(FOCAL, 0.0, (639.5, 359.5), (), SIZE, "given", "")
+EMPTY = np.zeros((0, 3), np.float32)
+NO_BUNDLE = Bundle(np.zeros(0, np.int32), EMPTY, EMPTY, EMPTY, np.zeros((0, 4), np.float32))
+NOISE = 0.0035  # of the outer-eye distance, which is about 0.09 m
+
+
+class Talker:
+    """A person of the head model who talks, blinks, looks about and turns the head for T frames."""
+
+    def __init__(self, frames: int, seed: int = 0, noise: float = NOISE):
+        rng = np.random.default_rng(seed)
+        t = np.arange(frames) / 25
+        self.identity = 0.6 * rng.normal(size=len(HEAD.identity_basis)).astype(np.float32)
+        self.expression = np.zeros((frames, len(NAMES)), np.float32)
+        for name, size, hertz in (
+            ("jawOpen", 0.35, 3.0),
+            ("mouthFunnel", 0.4, 2.3),
+            ("mouthSmileLeft", 0.3, 0.6),
+            ("mouthSmileRight", 0.3, 0.6),
+            ("eyeBlinkLeft", 0.8, 0.4),
+            ("eyeBlinkRight", 0.8, 0.4),
+        ):
+            self.expression[:, NAMES.index(name)] = size * np.clip(
+                np.sin(2 * np.pi * hertz * t + len(name)), 0, 1
+            )
+        self.eyes = np.zeros((frames, 2, 3), np.float32)
+        self.eyes[..., 1] = np.radians(12) * np.sin(3 * t)[:, None]
+        turn = Rotation.from_rotvec(np.radians([6.0, 18.0, 4.0]) * np.sin(np.outer(t, [0.9, 0.7, 0.5]) + 1))
+        self.rotation = turn.as_matrix() @ np.diag([1.0, -1.0, -1.0])
+        shift = np.array([0, 0, DISTANCE]) + 0.01 * np.sin(np.outer(t, [0.8, 0.5, 0.6]))
+        self.translation = shift - self.rotation @ HEAD.template.mean(0)
+        person = np.broadcast_to(self.identity, (frames, len(self.identity)))
+        vertices = HEAD.vertices(person, self.expression)
+        self.lips = 1e3 * (
+            vertices[:, HEAD.regions["lips"]]
+            - HEAD.vertices(self.identity, 0 * self.expression[0])[HEAD.regions["lips"]]
+        )
+        self.gap = HEAD.lip_gap_mm(vertices)
+        face = HEAD.landmark_positions(person, self.expression, eyes=self.eyes)
+        seen = face @ self.rotation.transpose(0, 2, 1) + self.translation[:, None]
+        pixels = FOCAL * seen[..., :2] / seen[..., 2:] + [639.5, 359.5]
+        pixels += noise * 0.09 * FOCAL / DISTANCE * rng.normal(size=pixels.shape)
+        points = np.zeros((frames, POINTS, 3), np.float32)
+        points[:, HEAD.landmark_embedding.landmarks] = np.dstack([pixels, seen[..., 2] * FOCAL / DISTANCE])
+        scores = np.zeros((frames, len(BLENDSHAPE_NAMES)), np.float32)
+        self.landmarks = Landmarks(t, points, np.ones(frames, np.float32), scores, BLENDSHAPE_NAMES, SIZE)
+
+    def fit(self, usable=None, segment=None, camera=CAMERA, landmarks=None):
+        landmarks = landmarks or self.landmarks
+        frames = len(landmarks.time)
+        usable = np.ones(frames, bool) if usable is None else usable
+        segment = np.zeros(frames, np.int32) if segment is None else segment
+        return fit_track(landmarks, camera, NO_BUNDLE, HEAD, usable, segment)
+
+
+def turn_error_deg(track, truth):
+    """[T] degrees."""
+    relative = Rotation.from_rotvec(track.rotation) * Rotation.from_matrix(truth).inv()
+    return np.degrees(relative.magnitude())
+
+
+def without_face(landmarks: Landmarks, gone: slice) -> Landmarks:
+    points, presence = landmarks.points.copy(), landmarks.presence.copy()
+    points[gone], presence[gone] = np.nan, 0
+    return replace(landmarks, points=points, presence=presence)
+
+
+def assert_finite(track):
+    for name in (
+        "identity",
+        "expression",
+        "rotation",
+        "translation",
+        "eyes",
+        "lip_gap_mm",
+        "reprojection_px",
+        "confidence",
+    ):
+        assert np.isfinite(getattr(track, name)).all(), name
+
+
+@pytest.fixture(scope="module")
+def talker() -> Talker:
+    return Talker(150)
+
+
+@pytest.fixture(scope="module")
+def track(talker):
+    return talker.fit()
+
+
+def test_lips_pose_and_opening_are_found(talker, track):
+    lips = 1e3 * np.tensordot(track.expression, HEAD.expression_basis[:, HEAD.regions["lips"]], axes=1)
+    error = (lips - lips.mean(0)) - (talker.lips - talker.lips.mean(0))
+    assert np.linalg.norm(error, axis=-1).mean() < 0.6
+    assert np.corrcoef(track.lip_gap_mm, talker.gap)[0, 1] > 0.99
+    assert np.sqrt(np.mean((track.lip_gap_mm - talker.gap) ** 2)) < 0.8
+    assert turn_error_deg(track, talker.rotation).mean() < 1.0
+    assert np.abs(track.translation - talker.translation).max() < 0.05
+    assert track.reprojection_px.mean() < 3 * NOISE * 0.09 * FOCAL / DISTANCE
+
+
+def test_gaze_follows_the_irises(talker, track):
+    open_eyes = talker.expression[:, NAMES.index("eyeBlinkLeft")] < 0.1
+    for side in range(2):
+        yaw = track.eyes[open_eyes, side, 1]
+        assert np.corrcoef(yaw, talker.eyes[open_eyes, side, 1])[0, 1] > 0.95
+
+
+def test_everything_has_its_shape_and_bounds(talker, track):
+    frames = len(talker.landmarks.time)
+    assert track.identity.shape == (len(HEAD.identity_basis),)
+    assert track.expression.shape == (frames, len(NAMES))
+    assert track.eyes.shape == (frames, 2, 3)
+    assert track.head == f"{HEAD.name}@{HEAD.sha256}"
+    assert_finite(track)
+    assert track.valid.all()
+    assert track.expression.min() >= 0
+    assert track.expression.max() <= 1
+    assert (
+        track.expression[:, NAMES.index("mouthClose")] <= track.expression[:, NAMES.index("jawOpen")]
+    ).all()
+    assert track.confidence.min() >= 0
+    assert 0.8 < np.median(track.confidence) <= 1
+
+
+def test_the_same_input_gives_the_same_track(talker, track):
+    again = talker.fit()
+    np.testing.assert_array_equal(again.expression, track.expression)
+    np.testing.assert_array_equal(again.rotation, track.rotation)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 4, 5])
+def test_short_clips(frames):
+    talker = Talker(frames)
+    track = talker.fit()
+    assert_finite(track)
+    assert track.valid.all()
+    assert turn_error_deg(track, talker.rotation).max() < 5
+
+
+def test_frames_without_a_face_take_the_nearest_pose_and_are_not_measured(talker):
+    gone = slice(40, 52)
+    track = talker.fit(landmarks=without_face(talker.landmarks, gone))
+    assert_finite(track)
+    np.testing.assert_array_equal(np.flatnonzero(~track.valid), np.arange(40, 52))
+    assert (track.confidence[gone] == 0).all()
+    np.testing.assert_array_equal(track.rotation[41], track.rotation[39])
+    np.testing.assert_array_equal(track.expression[50], track.expression[52])
+
+
+def test_frames_that_are_not_usable_do_not_touch_the_fit(talker):
+    usable = np.ones(150, bool)
+    usable[60:70] = False
+    points = talker.landmarks.points.copy()
+    reference = talker.fit(usable)
+    points[60:70] += 300
+    spoiled = talker.fit(usable, landmarks=replace(talker.landmarks, points=points))
+    np.testing.assert_array_equal(spoiled.expression, reference.expression)
+
+
+def test_smoothness_does_not_cross_a_cut():
+    first, second = Talker(40, seed=3), Talker(40, seed=3)
+    points = np.concatenate([first.landmarks.points, second.landmarks.points[::-1] + np.float32([200, 0, 0])])
+    whole = replace(
+        first.landmarks,
+        time=np.arange(80) / 25,
+        points=points,
+        presence=np.ones(80, np.float32),
+        blendshapes=np.zeros((80, 52), np.float32),
+    )
+    jump = np.linalg.norm
+    cut = first.fit(landmarks=whole, segment=np.repeat(np.int32([0, 1]), 40))
+    through = first.fit(landmarks=whole)
+    assert jump(cut.translation[40] - cut.translation[39]) > 0.07
+    assert cut.reprojection_px[38:42].mean() < through.reprojection_px[38:42].mean()
+    assert cut.reprojection_px[38:42].mean() < 1.3 * cut.reprojection_px.mean()
+
+
+def test_a_frame_with_wild_landmarks_is_not_trusted(talker):
+    points = talker.landmarks.points.copy()
+    points[80, :, :2] += np.random.default_rng(0).normal(size=(POINTS, 2)) * 15
+    track = talker.fit(landmarks=replace(talker.landmarks, points=points))
+    assert track.confidence[80] < 0.3
+    assert np.median(track.confidence) > 0.8
+
+
+def test_distortion_is_taken_out(talker):
+    import cv2
+
+    lens = replace(CAMERA, distortion=(-0.2, 0.05))
+    matrix = np.array([[FOCAL, 0, 639.5], [0, FOCAL, 359.5], [0, 0, 1]])
+    points = talker.landmarks.points[:20].copy()
+    rays = np.concatenate([(points[..., :2] - [639.5, 359.5]) / FOCAL, np.ones((20, POINTS, 1))], axis=2)
+    bent, _ = cv2.projectPoints(
+        rays.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), matrix, np.array([-0.2, 0.05, 0, 0])
+    )
+    points[..., :2] = bent.reshape(20, POINTS, 2)
+    few = replace(
+        talker.landmarks, points=points, time=talker.landmarks.time[:20], presence=np.ones(20, np.float32)
+    )
+    track = talker.fit(camera=lens, landmarks=few)
+    assert turn_error_deg(track, talker.rotation[:20]).mean() < 1.5
+    assert track.reprojection_px.mean() < 3 * NOISE * 0.09 * FOCAL / DISTANCE
+
+
+def test_no_face_at_all_is_one_clear_line(talker):
+    with pytest.raises(TrackError, match=r"no face to fit.*150 frames 150 are usable") as raised:
+        talker.fit(landmarks=without_face(talker.landmarks, slice(None)))
+    assert "\n" not in str(raised.value)
+    with pytest.raises(TrackError, match="0 are usable"):
+        talker.fit(usable=np.zeros(150, bool))
+
+
+def test_progress_ends_at_its_total(talker):
+    seen: list[tuple[int, int]] = []
+    fit_track(
+        talker.landmarks,
+        CAMERA,
+        NO_BUNDLE,
+        HEAD,
+        np.ones(150, bool),
+        np.zeros(150, np.int32),
+        lambda done, total: seen.append((done, total)),
+    )
+    assert seen[-1][0] == seen[-1][1]
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
