@@ -102,7 +102,8 @@ class Trainer:
         self._diffusion: Diffusion = checkpoint.diffusion()
         self._network = Network(checkpoint.config)
         self._network.load_state_dict(checkpoint.network)
-        self._average = {name: value.clone() for name, value in checkpoint.network.items()}
+        # In the network's own order, which a loaded file does not keep: the average follows tensor by tensor.
+        self._average = {name: checkpoint.network[name].clone() for name in self._network.state_dict()}
         self._optimizer = torch.optim.Adam(
             self._network.parameters(), lr=self.config.learning_rate, fused=True
         )
