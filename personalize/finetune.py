@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 from model.checkpoint import Checkpoint
@@ -51,8 +52,8 @@ def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     report.say("choosing the checkpoint and the guidance scale on the validation split")
     best, errors = choose_checkpoint(candidates, data.sequences("val"), settings.seed)
     sweep, chosen = sweep_guidance(best, data.sequences("val"), settings.seed, report.progress)
-    s = settings.guidance if settings.guidance is not None else chosen
-    best.with_weights(best.network, best.ema, guidance=s).save(folder / "checkpoint.safetensors")
+    best.with_weights(best.network, best.ema, guidance=chosen).save(folder / "checkpoint.safetensors")
     choice = {"lip_error_mm": dict(zip([path.stem for path in candidates], errors))}
-    write_json(folder / "guidance.json", {"sweep": sweep, "chosen": chosen, "used": s, "candidates": choice})
-    (work / "log.csv").replace(folder / "log.csv")
+    write_json(folder / "guidance.json", {"sweep": sweep, "chosen": chosen, "candidates": choice})
+    shutil.copy(work / "log.csv", folder / "log.csv")
+    shutil.rmtree(work)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from model.checkpoint import CheckpointError
-from model.motion import MotionError
+from model.errors import ModelError
 from personalize.errors import UserError
 from personalize.media import probe
 from personalize.reporter import Reporter
@@ -65,7 +64,7 @@ def personalize_video(
         run.begin(settings)
         try:
             run_stages(STAGES, Context(run, settings, report), first=first, until=until, force=force)
-        except (TrackError, CheckpointError, MotionError) as error:
+        except (TrackError, ModelError) as error:
             raise UserError(f"{video}: {error}") from error
     return {"run": folder} | {
         Path(name).stem: folder / name for name in PRODUCTS if (folder / name).is_file()

@@ -12,10 +12,8 @@ class Settings:
     iterations: fine-tuning steps (the paper: 30 000).
     seed: seed of every random draw.
     focal_px: focal length in pixels, None to estimate it.
-    guidance: guidance scale stored in the checkpoint, None to choose it on the validation split.
     """
 
     iterations: int = 30_000
     seed: int = 0
     focal_px: float | None = None
-    guidance: float | None = None

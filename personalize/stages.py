@@ -6,10 +6,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+
+import tracker.landmarker
+from personalize.subject_data import BASE_CHECKPOINT
 from tracker.camera import estimate_camera
 from tracker.head import load_head
 
-from model.checkpoint import BASE_CHECKPOINT
 from model.speech import load_encoder
 from personalize import run as files
 from personalize.evaluation.evaluate import evaluate_run
@@ -24,7 +26,10 @@ from personalize.registration import register_run
 from personalize.settings import Settings
 from personalize.stage import VIDEO, Context, Stage
 from tracker.fit import fit_track
-from tracker.landmarker import LANDMARKER_FILE, track_landmarks
+from tracker.landmarker import track_landmarks
+
+
+LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
 
 
 @cache
@@ -157,7 +162,7 @@ class Registration(Stage):
 class Finetune(Stage):
     """Motion + speech -> the subject's checkpoint."""
 
-    name, version, reads, resumes = "finetune", 1, ("iterations", "seed", "guidance"), True
+    name, version, reads, resumes = "finetune", 1, ("iterations", "seed"), True
     needs = (
         "ingest/audio.wav",
         "ingest/split.json",

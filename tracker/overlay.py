@@ -17,7 +17,7 @@ from tracker.track import Landmarks, Track
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 
-MESH_OPACITY = 0.6
+MESH_OPACITY = 0.5
 CLAY = (196, 178, 168)
 DETECTED, FITTED = (70, 235, 90), (255, 70, 60)
 GOOD, DOUBTFUL, BAD = (70, 200, 90), (245, 180, 40), (230, 60, 50)
@@ -64,7 +64,7 @@ def draw_overlay(rgb: U8, track: Track, frame: int, landmarks: Landmarks, head: 
         placed = place(track, frame, head)
         # Pixel centres are at integers: scaling moves them by half a pixel on both sides.
         principal = (track.principal + 0.5) * scale - 0.5
-        drawn = _draw_mesh(drawn, placed.vertices, track.focal * scale, principal, head)
+        _draw_mesh(drawn, placed.vertices, track.focal * scale, principal, head)
         detected = (landmarks.points[frame, :, :2] + 0.5) * scale - 0.5
         fitted = project(placed.landmarks, track.focal * scale, principal)
         radius = max(1, round(float(np.ptp(detected[:, 0])) / 200))
@@ -74,18 +74,23 @@ def draw_overlay(rgb: U8, track: Track, frame: int, landmarks: Landmarks, head: 
     return np.concatenate([picture, drawn], axis=1)
 
 
-def _draw_mesh(picture: U8, vertices: F32, focal: float, principal: F32, head: HeadModel) -> U8:
-    size = (picture.shape[1], picture.shape[0])
-    pixels = np.concatenate([project(vertices, focal, principal), vertices[:, 2:]], axis=1)
-    raster = rasterize(pixels, head.faces, size)
-    # The skull has no hair and no evidence: only the face is shown, or the picture would look worse than the fit.
+def _draw_mesh(picture: U8, vertices: F32, focal: float, principal: F32, head: HeadModel) -> None:
+    """Shade the face region into the picture. The skull has no hair and no evidence: it would only mislead."""
     shown = np.zeros(len(head.template), bool)
     shown[head.regions["face"]] = True
-    covered = (raster.triangle >= 0) & shown[head.faces].all(1)[raster.triangle]
+    faces = head.faces[shown[head.faces].all(1)]
+    pixels = np.concatenate([project(vertices, focal, principal), vertices[:, 2:]], axis=1)
+    low = np.maximum(np.floor(pixels[shown, :2].min(0)).astype(int), 0)
+    high = np.minimum(np.ceil(pixels[shown, :2].max(0)).astype(int) + 1, picture.shape[1::-1])
+    if (high <= low).any():
+        return
+    window = picture[low[1] : high[1], low[0] : high[0]]
+    pixels[:, :2] -= low
+    raster = rasterize(pixels, faces, (window.shape[1], window.shape[0]))
     clay = np.tile(np.asarray(CLAY, np.uint8), (len(vertices), 1))
-    shaded = shade(raster, head.faces, vertices, clay, picture)
-    mixed = cv2.addWeighted(shaded, MESH_OPACITY, picture, 1 - MESH_OPACITY, 0)
-    return np.where(covered[..., None], mixed, picture)
+    # Where there is no face the background is the picture itself, so that the mixture leaves it as it is.
+    shaded = shade(raster, faces, vertices, clay, window)
+    window[:] = cv2.addWeighted(shaded, MESH_OPACITY, window, 1 - MESH_OPACITY, 0)
 
 
 def _draw_points(picture: U8, points: F32, colour: tuple[int, int, int], radius: int) -> None:
