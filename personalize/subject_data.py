@@ -19,6 +19,8 @@ BASE_CHECKPOINT = Path(__file__).parent.parent / "model" / "assets" / "base.safe
 Part = Literal["train", "val", "test"]
 # Shorter spans hold no whole word: they are neither learned from nor judged.
 SHORTEST_SPAN_S = 1.0
+# Stretches of one part that lie closer than this (a cut between them) are one span: speech goes on across a cut.
+JOINED_GAP_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -60,10 +62,21 @@ def load_subject_data(run: RunFolder, style: int) -> SubjectData:
     parts: dict[str, list[Span]] = {}
     for part in ("train", "val", "test"):
         parts[part] = []
-        for start_s, end_s in split[part]:
+        for start_s, end_s in joined(split[part]):
             first, last = np.searchsorted(times, [start_s, end_s])
             if last - first >= SHORTEST_SPAN_S * motion.fps:
                 rows = slice(int(first), int(last))
                 sequence = Sequence(motion.coefficients[rows], features[rows], motion.valid[rows], style)
                 parts[part].append(Span(rows.start, rows.stop, sequence))
     return SubjectData(motion, features, parts)
+
+
+def joined(stretches: list[list[float]]) -> list[list[float]]:
+    """[[start, end], …] in s, in order -> the same with small gaps closed."""
+    result: list[list[float]] = []
+    for start_s, end_s in stretches:
+        if result and start_s - result[-1][1] < JOINED_GAP_S:
+            result[-1][1] = end_s
+        else:
+            result.append([start_s, end_s])
+    return result
