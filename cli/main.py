@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from collections.abc import Callable
 from typing import Annotated
 
 # Threads are set on purpose, per stage: left alone, OpenMP and BLAS both take every core and wait for each other.
@@ -19,7 +20,7 @@ from cli.run import run
 from personalize.errors import UserError
 from personalize.run import tool_version
 
-COMMANDS = {"run": run, "animate": animate, "demo": demo}
+COMMANDS: dict[str, Callable[..., None]] = {"run": run, "animate": animate, "demo": demo}
 INPUT_ERROR, BUG, INTERRUPTED = 2, 1, 130
 
 app = typer.Typer(

@@ -59,7 +59,9 @@ def subject_of(base: Checkpoint, name: str, train: Many[Sequence], provenance: d
     )
 
 
-def choose_checkpoint(candidates: Many[Path], validation: Many[Sequence], seed: int) -> tuple[Checkpoint, list[float]]:
+def choose_checkpoint(
+    candidates: Many[Path], validation: Many[Sequence], seed: int
+) -> tuple[Checkpoint, list[float]]:
     """The candidate with the smallest lip error on validation at s = 0.99, and every candidate's error, mm.
 
     The error is lip_sync + l2_lip, both in mm: timing and place of the lips.
@@ -70,7 +72,8 @@ def choose_checkpoint(candidates: Many[Path], validation: Many[Sequence], seed: 
     errors = []
     for checkpoint in loaded:
         rows = [
-            validation_metrics(checkpoint, sequence, CHOICE_GUIDANCE, 1, seed, CHOICE_STEPS) for sequence in validation
+            validation_metrics(checkpoint, sequence, CHOICE_GUIDANCE, 1, seed, CHOICE_STEPS)
+            for sequence in validation
         ]
         frames = [int(sequence.valid.sum()) for sequence in validation]
         errors.append(float(np.average([row["lip_sync"] + row["l2_lip"] for row in rows], weights=frames)))
@@ -78,7 +81,12 @@ def choose_checkpoint(candidates: Many[Path], validation: Many[Sequence], seed: 
 
 
 def validation_metrics(
-    checkpoint: Checkpoint, sequence: Sequence, s: float, samples: int, seed: int, ddim_steps: int | None = None
+    checkpoint: Checkpoint,
+    sequence: Sequence,
+    s: float,
+    samples: int,
+    seed: int,
+    ddim_steps: int | None = None,
 ) -> dict[str, float]:
     """METHOD's metrics of synthesized samples of one sequence."""
     drawn = synthesize(
@@ -103,7 +111,9 @@ def sweep_guidance(
     sweep = []
     for done, s in enumerate(SWEEP):
         metrics = validation_metrics(checkpoint, part, s, SWEEP_SAMPLES, seed)
-        sweep.append({"s": s} | {n: metrics[n] for n in ("lip_sync", "lip_max", "l2_lip", "l2_face", "div_e")})
+        sweep.append(
+            {"s": s} | {n: metrics[n] for n in ("lip_sync", "lip_max", "l2_lip", "l2_face", "div_e")}
+        )
         if progress is not None:
             progress(done + 1, len(SWEEP))
     best = min(row["lip_sync"] for row in sweep)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def write_atomic(path: Path, write: Callable[[IO[bytes]], None]) -> None:
+def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Let `write` fill a temporary file beside `path`, flush it to disk, then rename it to `path`."""
     temporary = path.with_name(f".{path.name}.partial")
     with temporary.open("wb") as stream:
@@ -25,7 +25,7 @@ def write_atomic(path: Path, write: Callable[[IO[bytes]], None]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """UTF-8 text, atomically."""
-    write_atomic(path, lambda stream: stream.write(text.encode()) and None)
+    write_atomic(path, lambda stream: stream.write(text.encode()))
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -35,7 +35,7 @@ def write_json(path: Path, value: Any) -> None:
 
 def write_npz(path: Path, **arrays: NDArray[Any]) -> None:
     """Compressed `.npz`, atomically."""
-    write_atomic(path, lambda stream: np.savez_compressed(stream, **arrays))
+    write_atomic(path, lambda stream: np.savez_compressed(stream, **arrays))  # type: ignore[arg-type]
 
 
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:

@@ -8,13 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tracker.head import load_head
 
 from personalize.files import write_atomic
 from personalize.media import VideoWriter, on_video_clock, read_audio, read_frames
 from personalize.quality import frame_reason
 from personalize.run import RunFolder, read_landmarks, read_track
 from personalize.run import read_frames as read_frame_table
+from tracker.head import load_head
 from tracker.overlay import contact_sheet, draw_overlay, panel_size
 
 PREVIEW_WIDTH, PREVIEW_CRF, PREVIEW_S = 720, 30, 60.0
@@ -51,7 +51,7 @@ def write_overlay(run: RunFolder, folder: Path, progress: Callable[[int, int], N
             progress(frame + 1, total)
     sheet = contact_sheet([kept[frame] for frame in notable_frames(track.valid, track.confidence)])
     _, png = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
-    write_atomic(folder / "contact_sheet.png", lambda stream: stream.write(png.tobytes()) and None)
+    write_atomic(folder / "contact_sheet.png", lambda stream: stream.write(png.tobytes()))
 
 
 def notable_frames(valid: NDArray[np.bool_], confidence: NDArray[np.float32]) -> NDArray[np.intp]:

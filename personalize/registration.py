@@ -14,7 +14,6 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
-from tracker.head import HeadModel, load_head
 
 from model.checkpoint import Checkpoint
 from model.motion import FPS, Motion, topology_hash
@@ -24,6 +23,7 @@ from personalize.media import read_audio
 from personalize.reporter import Reporter
 from personalize.run import RunFolder, read_frames, read_track, tool_version
 from personalize.subject_data import BASE_CHECKPOINT
+from tracker.head import HeadModel, load_head
 from tracker.track import Track
 
 F32 = NDArray[np.float32]

@@ -8,10 +8,6 @@ from pathlib import Path
 import numpy as np
 
 import tracker.landmarker
-from personalize.subject_data import BASE_CHECKPOINT
-from tracker.camera import estimate_camera
-from tracker.head import load_head
-
 from model.speech import load_encoder
 from personalize import run as files
 from personalize.evaluation.evaluate import evaluate_run
@@ -25,9 +21,11 @@ from personalize.quality import write_quality
 from personalize.registration import register_run
 from personalize.settings import Settings
 from personalize.stage import VIDEO, Context, Stage
+from personalize.subject_data import BASE_CHECKPOINT
+from tracker.camera import estimate_camera
 from tracker.fit import fit_track
+from tracker.head import load_head
 from tracker.landmarker import track_landmarks
-
 
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
 
@@ -182,8 +180,10 @@ class Evaluate(Stage):
     """Metrics on the test split, one clip beside its reference, the report."""
 
     name, folder, version, reads = "evaluate", "evaluation", 1, ("seed",)
-    needs = (VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv")
-    needs += ("overlay/preview.mp4", "overlay/contact_sheet.png", "refine/track.npz")
+    needs = (
+        *(VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv"),
+        *("overlay/preview.mp4", "overlay/contact_sheet.png", "refine/track.npz"),
+    )
     makes, products = ("metrics.json", "samples/test.mp4", "samples/test.npz"), ("report.html",)
 
     def make(self, context: Context, folder: Path) -> None:

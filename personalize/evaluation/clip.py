@@ -49,7 +49,9 @@ def write_clip(
 def _face_pictures(run: RunFolder, time: NDArray[np.float64]) -> list[U8]:
     """The video cut to the face at times [n] s, one picture of PANEL size each: the frame shown at that time."""
     landmarks = read_landmarks(run.path / "landmarks/landmarks.npz")
-    shown = np.clip(np.searchsorted(landmarks.time, time + 1e-6, side="right") - 1, 0, len(landmarks.time) - 1)
+    shown = np.clip(
+        np.searchsorted(landmarks.time, time + 1e-6, side="right") - 1, 0, len(landmarks.time) - 1
+    )
     points = landmarks.points[shown[0] : shown[-1] + 1, :, :2]
     low, high = np.nanmin(points, axis=(0, 1)), np.nanmax(points, axis=(0, 1))
     middle = (low + high) / 2

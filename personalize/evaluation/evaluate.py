@@ -42,7 +42,9 @@ class Evaluation:
     samples: F32
 
 
-def predict(system: str, data: SubjectData, span: Span, subject: Checkpoint, base: Checkpoint, seed: int) -> F32:
+def predict(
+    system: str, data: SubjectData, span: Span, subject: Checkpoint, base: Checkpoint, seed: int
+) -> F32:
     """Coefficients [S, n, K] m that a system synthesizes for a span; S is 1 for the two that cannot vary."""
     rows = slice(span.first, span.last)
     train = np.concatenate([s.coefficients[s.valid] for s in data.sequences("train")])
@@ -82,7 +84,8 @@ def evaluate_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
                 clip_samples = samples
         weights = np.array([weight for _, weight in rows], float)
         systems[system] = {
-            name: float(np.average([metrics[name] for metrics, _ in rows], weights=weights)) for name in rows[0][0]
+            name: float(np.average([metrics[name] for metrics, _ in rows], weights=weights))
+            for name in rows[0][0]
         }
         report.progress(done + 1, len(SYSTEMS) + 1)
     metrics = {
@@ -114,7 +117,9 @@ def _write_samples(
     (folder / "samples").mkdir()
     write_npz(folder / "samples/test.npz", time=time, reference=reference, samples=samples[:, :length])
     write_clip(run, folder / "samples/test.mp4", data.motion, subject, time, reference, samples[0, :length])
-    gaps = lip_opening_mm(subject, data.motion.template, np.concatenate([reference[None], samples[:, :length]]))
+    gaps = lip_opening_mm(
+        subject, data.motion.template, np.concatenate([reference[None], samples[:, :length]])
+    )
     return Evaluation(metrics, time, gaps[0], gaps[1:])
 
 

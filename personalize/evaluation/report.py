@@ -41,7 +41,7 @@ def write_report(run: RunFolder, evaluation: Evaluation, folder: Path) -> None:
     )
     metrics = evaluation.metrics
     duration = float(track.time[-1])
-    reasons = [frame_reason(frames, track, frame) for frame in np.flatnonzero(~track.valid)]
+    reasons = [frame_reason(frames, track, frame) for frame in np.flatnonzero(~track.valid).tolist()]
     page = environment.get_template("report.html").render(
         video=run.video.name,
         version=tool_version(),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from tracker.head import load_head
 
 from model.motion import topology_hash
+from tracker.head import load_head
 from tracker.raster import render
 
 F32 = NDArray[np.float32]
