@@ -1,0 +1,228 @@
+"""The clip's camera: focal length from rigid feature tracks where they can tell it, else from a stated prior.
+
+The upper face is a rigid body that turns before a camera whose focal length never changes, so all shots of a
+clip are adjusted together with one focal. Its uncertainty comes from the adjustment's covariance and decides how
+much the prior still counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial.transform import Rotation
+
+from tracker.bundle_adjustment import RigidScene, absolute_pose, adjust, camera_model
+from tracker.feature_tracks import FeatureTracks, Frame, track_features
+from tracker.head import HeadModel
+from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, UPPER_FACE
+from tracker.track import F64, Bundle, Camera, Landmarks
+
+PRIOR_FOCAL = 1.3  # of the picture's long side: phones and webcams .7-1.2, camcorders and portraits 1.2-2.5
+PRIOR_SD_LOG = 0.35
+FOCAL_RANGE = (0.6, 5.0)  # of the long side
+MIN_TURN_DEG = 8.0  # a head that turns less leaves focal length and depth undecided
+OUTLIER = (
+    0.08  # of the distance between the outer eye corners: farther landmarks do not count for a frame's pose
+)
+MIN_OBSERVATIONS = 12  # of a frame in the bundle
+MIN_LENGTH = 3  # observations of a point in the bundle
+
+
+def estimate_camera(
+    landmarks: Landmarks,
+    frames: Callable[[], Iterable[Frame]],
+    head: HeadModel,
+    focal_given: float | None = None,
+    usable: NDArray[np.bool_] | None = None,
+    segments: NDArray[np.int32] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Camera, Bundle]:
+    """The camera of one clip and the rigid evidence for it, in the frame of the mean head.
+
+    frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for each row of the landmarks. focal_given: px,
+    then nothing is estimated but poses and points. usable: [T] bool. segments: [T], number of the uninterrupted shot.
+    """
+    total = len(landmarks.time)
+    usable = np.ones(total, bool) if usable is None else usable
+    segments = np.zeros(total, np.int32) if segments is None else segments
+    prior = _camera(landmarks.size, focal_given)
+    tracks = track_features(frames(), landmarks, usable, segments, progress)
+    start = _start(tracks, landmarks, head, prior)
+    if focal_given is not None or not len(start.observations):
+        return prior, _bundle(start, prior)
+    found = adjust(start, camera_model(prior.focal_px, prior.principal_px, prior.size), refine_focal=True)
+    camera = prior
+    if found is not None:
+        scene, focal, formal = found
+        camera = _joined(prior, focal, _focal_sd_log(scene, focal, formal, prior), _turn_deg(scene))
+    if camera.method == "bundle":
+        start = _scaled(scene, camera.focal_px / focal)
+    return camera, _bundle(start, camera)
+
+
+def _camera(size: tuple[int, int], focal_given: float | None) -> Camera:
+    """The camera before any evidence from the clip."""
+    long_side = max(size)
+    sentence = (
+        f"log-normal about {PRIOR_FOCAL} x the long side ({PRIOR_FOCAL * long_side:.0f} px), "
+        f"sd {PRIOR_SD_LOG} of the logarithm, within {FOCAL_RANGE[0]}-{FOCAL_RANGE[1]} x the long side; "
+        "principal point at the centre; no distortion"
+    )
+    return Camera(
+        focal_px=float(focal_given or PRIOR_FOCAL * long_side),
+        focal_sd_log=0.0 if focal_given else PRIOR_SD_LOG,
+        principal_px=((size[0] - 1) / 2, (size[1] - 1) / 2),
+        distortion=(),
+        size=size,
+        method="given" if focal_given else "prior",
+        prior="none: the focal length was given" if focal_given else sentence,
+    )
+
+
+def _joined(prior: Camera, focal: float, sd_log: float, turn_deg: float) -> Camera:
+    """Prior and bundle joined in log space, or the prior alone where the bundle tells less than it."""
+    low, high = (bound * max(prior.size) for bound in FOCAL_RANGE)
+    if turn_deg < MIN_TURN_DEG or sd_log >= PRIOR_SD_LOG or not low <= focal <= high:
+        return prior
+    weight, prior_weight = sd_log**-2, PRIOR_SD_LOG**-2
+    log_focal = (weight * np.log(focal) + prior_weight * np.log(prior.focal_px)) / (weight + prior_weight)
+    return replace(
+        prior,
+        focal_px=float(np.clip(np.exp(log_focal), low, high)),
+        focal_sd_log=float((weight + prior_weight) ** -0.5),
+        method="bundle",
+    )
+
+
+def _focal_sd_log(scene: RigidScene, focal: float, formal: float, camera: Camera) -> float:
+    """Standard deviation of log(focal): the formal one, for errors as large and as dependent as they are.
+
+    The error of a track hardly changes from one frame to the next, so tracks count, not observations.
+    """
+    noise = 1.4826 * float(np.median(np.abs(scene.residuals(focal, camera.principal_px))))
+    length = np.bincount(scene.observations[:, 1].astype(int))
+    return formal * noise * float(np.sqrt((length**2).sum() / length.sum()))
+
+
+def _turn_deg(scene: RigidScene) -> float:
+    """How far the direction from the head to the camera turns within a window, 5 % of the frames left out."""
+    towards = -np.einsum("mji,mj->mi", scene.rotation, scene.translation)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    turns = [0.0]
+    for number in np.unique(scene.window):
+        mine = towards[scene.window == number]
+        middle = mine.mean(0) / np.linalg.norm(mine.mean(0))
+        turns.append(2 * float(np.quantile(np.arccos(np.clip(mine @ middle, -1, 1)), 0.95)))
+    return float(np.degrees(max(turns)))
+
+
+def _start(tracks: FeatureTracks, landmarks: Landmarks, head: HeadModel, camera: Camera) -> RigidScene:
+    """Poses from the mean head's landmarks, and points where the tracks begin on its surface."""
+    embedding = head.landmark_embedding
+    rigid = np.isin(embedding.landmarks, UPPER_FACE)
+    mean = np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis))
+    surface = head.landmark_positions(*mean)[rigid].astype(np.float64)
+    xy = landmarks.points[tracks.frames][:, embedding.landmarks[rigid], :2].astype(np.float64)
+    eyes = landmarks.points[tracks.frames][:, [RIGHT_EYE_OUTER, LEFT_EYE_OUTER], :2]
+    errors = OUTLIER * np.linalg.norm(eyes[:, 0] - eyes[:, 1], axis=1)
+    model = camera_model(camera.focal_px, camera.principal_px, camera.size)
+    poses = [absolute_pose(seen, surface, model, float(error)) for seen, error in zip(xy, errors)]
+    good = np.array([pose is not None for pose in poses], bool)
+    known = [pose for pose in poses if pose is not None]
+    scene = RigidScene(
+        frames=tracks.frames[good],
+        rotation=np.array([rotation for rotation, _ in known]).reshape(-1, 3, 3),
+        translation=np.array([translation for _, translation in known]).reshape(-1, 3),
+        points=_points(tracks, xy, surface),
+        observations=tracks.observations.astype(np.float64),
+        window=tracks.window[good],
+    )
+    return _pruned(scene)
+
+
+def _points(tracks: FeatureTracks, xy: F64, surface: F64) -> F64:
+    """[Q, 3] m, NaN off the surface: each track's first place on the mean head, between its landmarks.
+
+    xy: [M, L, 2] px and surface: [L, 3] m, the same landmarks in the picture and on the head.
+    """
+    numbers, first = np.unique(tracks.observations[:, 1].astype(int), return_index=True)
+    points = np.full((len(numbers), 3), np.nan)
+    begun = tracks.observations[first]
+    for row, frame in enumerate(tracks.frames):
+        mine = begun[:, 0] == frame
+        if mine.any():
+            points[mine] = LinearNDInterpolator(xy[row], surface)(begun[mine, 2:])
+    return points
+
+
+def _pruned(scene: RigidScene) -> RigidScene:
+    """Without frames and points that see, or are seen, too little; with none left, the poses alone stay."""
+    rows = scene.observations[np.isfinite(scene.points[scene.observations[:, 1].astype(int)]).all(1)]
+    rows = rows[np.isin(rows[:, 0], scene.frames)]
+    while len(rows):
+        frame, point = rows[:, 0].astype(int), rows[:, 1].astype(int)
+        keep = (np.bincount(frame)[frame] >= MIN_OBSERVATIONS) & (np.bincount(point)[point] >= MIN_LENGTH)
+        if keep.all():
+            break
+        rows = rows[keep]
+    if not len(rows):
+        return replace(scene, points=np.zeros((0, 3)), observations=np.zeros((0, 4)))
+    seen = np.isin(scene.frames, rows[:, 0])
+    kept, number = np.unique(rows[:, 1].astype(int), return_inverse=True)
+    return replace(
+        scene,
+        frames=scene.frames[seen],
+        rotation=scene.rotation[seen],
+        translation=scene.translation[seen],
+        window=scene.window[seen],
+        points=scene.points[kept],
+        observations=np.column_stack([rows[:, 0], number, rows[:, 2:]]),
+    )
+
+
+def _scaled(scene: RigidScene, factor: float) -> RigidScene:
+    """The scene for a focal longer by `factor`: as far again from the camera."""
+    return replace(scene, translation=scene.translation * (1, 1, factor))
+
+
+def _bundle(start: RigidScene, camera: Camera) -> Bundle:
+    """The scene adjusted under the camera as it is now, back in the frame of the mean head."""
+    model = camera_model(camera.focal_px, camera.principal_px, camera.size)
+    found = adjust(start, model, refine_focal=False) if len(start.observations) else None
+    scene = start if found is None else _in_head_frame(found[0], start)
+    return Bundle(
+        frame=scene.frames.astype(np.int32),
+        rotation=Rotation.from_matrix(scene.rotation).as_rotvec().astype(np.float32).reshape(-1, 3),
+        translation=scene.translation.astype(np.float32),
+        points=scene.points.astype(np.float32),
+        observations=scene.observations.astype(np.float32),
+    )
+
+
+def _in_head_frame(scene: RigidScene, start: RigidScene) -> RigidScene:
+    """Each window's scene moved, turned and scaled as a whole onto the points as they began."""
+    rotation, translation, points = scene.rotation.copy(), scene.translation.copy(), scene.points.copy()
+    window_of = np.full(len(points), -1)
+    row = np.searchsorted(scene.frames, scene.observations[:, 0].astype(int))
+    window_of[scene.observations[:, 1].astype(int)] = scene.window[row]
+    for number in np.unique(scene.window):
+        mine, poses = window_of == number, scene.window == number
+        turn, scale, shift = _similarity(scene.points[mine], start.points[mine])
+        points[mine] = scale * scene.points[mine] @ turn.T + shift
+        rotation[poses] = scene.rotation[poses] @ turn.T
+        translation[poses] = scale * scene.translation[poses] - rotation[poses] @ shift
+    return replace(scene, rotation=rotation, translation=translation, points=points)
+
+
+def _similarity(source: F64, target: F64) -> tuple[F64, float, F64]:
+    """Rotation, scale and shift that take source [n, 3] closest to target [n, 3] in least squares."""
+    a, b = source - source.mean(0), target - target.mean(0)
+    u, size, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    turn = (u * sign) @ vt
+    scale = float((size * sign).sum() / (a**2).sum())
+    return turn, scale, target.mean(0) - scale * turn @ source.mean(0)
