@@ -100,11 +100,11 @@ def transfer_between(base: BaseFace, template: F32, faces: NDArray[np.int32]) ->
     low, high = base.template.min(0), base.template.max(0)
     scale = float(np.linalg.norm(np.ptp(template, axis=0)) / np.linalg.norm(high - low))
     start = (base.template - (low + high) / 2) * scale + (template.min(0) + template.max(0)) / 2
-    source = trimesh.Trimesh(start, base.faces, process=False)
-    matrix, _ = trimesh.registration.mesh_other(
-        source, target, samples=2000, scale=True, icp_first=10, icp_final=30
+    # Not trimesh's mesh_other: it also tries the head upside down.
+    _, aligned, _ = trimesh.registration.icp(
+        start, target, threshold=1e-7, max_iterations=50, reflection=False
     )
-    source.apply_transform(matrix)
+    source = trimesh.Trimesh(aligned, base.faces, process=False)
     fitted = trimesh.registration.nricp_amberg(source, target, distance_threshold=0.02)
     closest, distance, triangle = trimesh.proximity.closest_point(target, fitted)
     weights = trimesh.triangles.points_to_barycentric(target.triangles[triangle], closest)
