@@ -18,6 +18,8 @@ LOSS_SCALE = 0.7  # px, Cauchy: corners on brows, or under a moving highlight, c
 MAX_ITERATIONS = 40
 SEED = 0
 
+pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # a rejected step is no news to a user
+
 
 @dataclass(frozen=True)
 class RigidScene:
@@ -66,10 +68,14 @@ def absolute_pose(xy: F64, points: F64, camera: pycolmap.Camera, max_error: floa
 
 
 def adjust(
-    scene: RigidScene, camera: pycolmap.Camera, refine_focal: bool
+    scene: RigidScene,
+    camera: pycolmap.Camera,
+    refine_focal: bool,
+    fixed: NDArray[np.bool_] | None = None,
 ) -> tuple[RigidScene, float, float] | None:
     """Bundle adjustment over poses, points and, if asked, the focal length; None where it fails.
 
+    fixed: [Q] bool, points that stay where they are.
     Returns the adjusted scene, the focal px and the formal standard deviation of its logarithm, which counts every
     observation as independent with an error of 1 px (0 when not refined).
     """
@@ -77,8 +83,14 @@ def adjust(
     config = pycolmap.BundleAdjustmentConfig()
     for frame in scene.frames:
         config.add_image(int(frame) + 1)
+    held = np.zeros(len(scene.points), bool) if fixed is None else fixed
+    for point in np.flatnonzero(held):
+        config.add_constant_point(int(point) + 1)
     # Each window is free to move and scale as a whole: one pose holds it, damping holds its scale.
-    for first in np.unique(scene.window, return_index=True)[1]:
+    row = np.searchsorted(scene.frames, scene.observations[:, 0].astype(int))
+    free = np.unique(scene.window[row[~held[scene.observations[:, 1].astype(int)]]])
+    for number in free:
+        first = int(np.argmax(scene.window == number))
         config.set_constant_rig_from_world_pose(int(scene.frames[first]) + 1)
     if not refine_focal:
         config.set_constant_cam_intrinsics(1)

@@ -30,6 +30,9 @@ OUTLIER = (
 )
 MIN_OBSERVATIONS = 12  # of a frame in the bundle
 MIN_LENGTH = 3  # observations of a point in the bundle
+MAX_DEPARTURE = (
+    0.005  # m, median from the mean head: 3 mm is another identity, more the noise of a still head
+)
 
 
 def estimate_camera(
@@ -52,16 +55,15 @@ def estimate_camera(
     prior = _camera(landmarks.size, focal_given)
     tracks = track_features(frames(), landmarks, usable, segments, progress)
     start = _start(tracks, landmarks, head, prior)
-    if focal_given is not None or not len(start.observations):
-        return prior, _bundle(start, prior)
-    found = adjust(start, camera_model(prior.focal_px, prior.principal_px, prior.size), refine_focal=True)
+    model = camera_model(prior.focal_px, prior.principal_px, prior.size)
+    found = adjust(start, model, refine_focal=focal_given is None) if len(start.observations) else None
+    if found is None:
+        return prior, _bundle(start)
+    scene, focal, formal = found
     camera = prior
-    if found is not None:
-        scene, focal, formal = found
+    if focal_given is None:
         camera = _joined(prior, focal, _focal_sd_log(scene, focal, formal, prior), _turn_deg(scene))
-    if camera.method == "bundle":
-        start = _scaled(scene, camera.focal_px / focal)
-    return camera, _bundle(start, camera)
+    return camera, _bundle(_final(scene, start, focal, camera))
 
 
 def _camera(size: tuple[int, int], focal_given: float | None) -> Camera:
@@ -184,16 +186,45 @@ def _pruned(scene: RigidScene) -> RigidScene:
     )
 
 
-def _scaled(scene: RigidScene, factor: float) -> RigidScene:
-    """The scene for a focal longer by `factor`: as far again from the camera."""
-    return replace(scene, translation=scene.translation * (1, 1, factor))
+def _final(scene: RigidScene, start: RigidScene, focal: float, camera: Camera) -> RigidScene:
+    """The scene, adjusted with a free focal, once more under the final camera and in the mean head's frame.
 
-
-def _bundle(start: RigidScene, camera: Camera) -> Bundle:
-    """The scene adjusted under the camera as it is now, back in the frame of the mean head."""
+    Where a window's head is too still to tell its shape, the points stay on the mean head.
+    """
+    factor = camera.focal_px / focal
+    settled, loose = _settled(replace(scene, translation=scene.translation * (1, 1, factor)), start)
     model = camera_model(camera.focal_px, camera.principal_px, camera.size)
-    found = adjust(start, model, refine_focal=False) if len(start.observations) else None
-    scene = start if found is None else _in_head_frame(found[0], start)
+    found = adjust(settled, model, refine_focal=False, fixed=loose)
+    return _settled(found[0], start)[0] if found is not None else settled
+
+
+def _settled(scene: RigidScene, start: RigidScene) -> tuple[RigidScene, NDArray[np.bool_]]:
+    """Each window moved, turned and scaled as a whole onto its points as they began, on the mean head.
+
+    A window whose points then lie far from where they began gets these back, with its first poses; [Q] says
+    which points these are.
+    """
+    rotation, translation, points = scene.rotation.copy(), scene.translation.copy(), scene.points.copy()
+    row = np.searchsorted(scene.frames, scene.observations[:, 0].astype(int))
+    window_of = np.zeros(len(points), np.int64)
+    window_of[scene.observations[:, 1].astype(int)] = scene.window[row]
+    loose = np.zeros(len(points), bool)
+    for number in np.unique(scene.window):
+        mine, poses = window_of == number, scene.window == number
+        turn, scale, shift = _similarity(scene.points[mine], start.points[mine])
+        moved = scale * scene.points[mine] @ turn.T + shift
+        if np.median(np.linalg.norm(moved - start.points[mine], axis=1)) > MAX_DEPARTURE:
+            loose |= mine
+            points[mine] = start.points[mine]
+            rotation[poses], translation[poses] = start.rotation[poses], start.translation[poses]
+            continue
+        points[mine] = moved
+        rotation[poses] = scene.rotation[poses] @ turn.T
+        translation[poses] = scale * scene.translation[poses] - rotation[poses] @ shift
+    return replace(scene, rotation=rotation, translation=translation, points=points), loose
+
+
+def _bundle(scene: RigidScene) -> Bundle:
     return Bundle(
         frame=scene.frames.astype(np.int32),
         rotation=Rotation.from_matrix(scene.rotation).as_rotvec().astype(np.float32).reshape(-1, 3),
@@ -203,26 +234,20 @@ def _bundle(start: RigidScene, camera: Camera) -> Bundle:
     )
 
 
-def _in_head_frame(scene: RigidScene, start: RigidScene) -> RigidScene:
-    """Each window's scene moved, turned and scaled as a whole onto the points as they began."""
-    rotation, translation, points = scene.rotation.copy(), scene.translation.copy(), scene.points.copy()
-    window_of = np.full(len(points), -1)
-    row = np.searchsorted(scene.frames, scene.observations[:, 0].astype(int))
-    window_of[scene.observations[:, 1].astype(int)] = scene.window[row]
-    for number in np.unique(scene.window):
-        mine, poses = window_of == number, scene.window == number
-        turn, scale, shift = _similarity(scene.points[mine], start.points[mine])
-        points[mine] = scale * scene.points[mine] @ turn.T + shift
-        rotation[poses] = scene.rotation[poses] @ turn.T
-        translation[poses] = scale * scene.translation[poses] - rotation[poses] @ shift
-    return replace(scene, rotation=rotation, translation=translation, points=points)
-
-
 def _similarity(source: F64, target: F64) -> tuple[F64, float, F64]:
-    """Rotation, scale and shift that take source [n, 3] closest to target [n, 3] in least squares."""
-    a, b = source - source.mean(0), target - target.mean(0)
-    u, size, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
-    turn = (u * sign) @ vt
-    scale = float((size * sign).sum() / (a**2).sum())
-    return turn, scale, target.mean(0) - scale * turn @ source.mean(0)
+    """Rotation, scale and shift that take most of source [n, 3] closest to target [n, 3].
+
+    Least squares over the points that are not far off: the depth of short tracks can be anything.
+    """
+    near = np.ones(len(source), bool)
+    for _ in range(5):
+        centre, goal = source[near].mean(0), target[near].mean(0)
+        a, b = source[near] - centre, target[near] - goal
+        u, size, vt = np.linalg.svd(b.T @ a)
+        sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+        turn = (u * sign) @ vt
+        scale = float((size * sign).sum() / (a**2).sum())
+        shift = goal - scale * turn @ centre
+        departure = np.linalg.norm(scale * source @ turn.T + shift - target, axis=1)
+        near = departure <= 2.5 * np.median(departure)
+    return turn, scale, shift
