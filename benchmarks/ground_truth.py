@@ -16,14 +16,18 @@ from scipy.spatial import cKDTree
 from torch import from_numpy
 
 from tracker.head import HeadModel
+from tracker.raster import vertex_normals
 from tracker.track import F64, Track
+
+NORMAL_M = 0.01  # two points whose normals differ by a unit count as this far apart
 
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Of T frames: neutral [V, 3] and displacement [T, V, 3] m, pose to the OpenCV camera, lip_gap_mm [T]."""
+    """Of T frames: neutral [V, 3], faces [F, 3], displacement [T, V, 3] m, pose to the OpenCV camera, lip_gap_mm [T]."""
 
     neutral: F64
+    faces: NDArray[np.int32]
     displacement: F64
     rotation: F64
     translation: F64
@@ -36,6 +40,7 @@ class GroundTruth:
         with np.load(path, allow_pickle=False) as file:
             return cls(
                 neutral=file["neutral"].astype(np.float64),
+                faces=file["faces"],
                 displacement=file["displacement_q"] * float(file["displacement_scale"]),
                 rotation=np.diag([1.0, -1.0, -1.0]) @ file["rotation"].astype(np.float64),
                 translation=file["translation"].astype(np.float64),
@@ -47,18 +52,17 @@ class GroundTruth:
 def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, float]:
     """Errors by name: mm, degrees, or r for correlations; `lip_motion_truth` is how large the motion was."""
     fitted = axis_angle_to_rotation_matrix(from_numpy(track.rotation.astype(np.float64))).numpy()
-    neutral = head.vertices(track.identity, np.zeros(len(head.expression_names), np.float32)).astype(
-        np.float64
-    )
+    resting = np.zeros(len(head.expression_names), np.float32)
+    neutral: F64 = head.vertices(track.identity, resting).astype(np.float64)
     face, lips = head.regions["face"], head.regions["lips"]
     scale, turn, shift = _align(neutral, face, track, fitted, truth)
     aligned = scale * neutral @ turn.T + shift
     surface, _ = cKDTree(truth.neutral).query(aligned[face])
     near = surface < np.quantile(surface, 0.95)  # the two heads do not end at the same rim
-    _, partner = cKDTree(truth.neutral).query(aligned[lips])
+    partner = _partners(aligned, head.faces, truth)[lips]
     seen = np.flatnonzero(track.valid)
-    moved = np.tensordot(track.expression[seen], head.expression_basis[:, lips], axes=1)
-    moved = 1e3 * scale * moved @ turn.T
+    moves: F64 = head.expression_basis[:, lips].astype(np.float64)
+    moved = 1e3 * scale * np.tensordot(track.expression[seen], moves, axes=1) @ turn.T
     true = truth.displacement[seen][:, partner] * 1e3
     error = (moved - moved.mean(0)) - (true - true.mean(0))
     gap, true_gap = track.lip_gap_mm[seen] * scale, truth.lip_gap_mm[seen]
@@ -78,6 +82,15 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
         "jitter_mm": float(np.linalg.norm(jitter, axis=-1).mean()),
         "rotation_deg": rotation_error(fitted[seen], truth.rotation[seen]),
     }
+
+
+def _partners(aligned: F64, faces: NDArray[np.int32], truth: GroundTruth) -> NDArray[np.int64]:
+    """[D] the true vertex for each of the fitted head's, near and turned alike: closed lips touch each other."""
+
+    def features(vertices: F64, faces: NDArray[np.int32]) -> F64:
+        return np.concatenate([vertices, NORMAL_M * vertex_normals(vertices, faces)], axis=1)
+
+    return cKDTree(features(truth.neutral, truth.faces)).query(features(aligned, faces))[1]
 
 
 def rotation_error(fitted: F64, true: F64) -> float:

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from tracker.head import HeadModel, load_head
 
 from benchmarks.ground_truth import GroundTruth, compare
 from personalize.media import read_frames
 from tracker.energy import rotation_matrix
 from tracker.fit import fit_track
+from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, LEFT_EYE_OUTER, POINTS, RIGHT_EYE_OUTER
 from tracker.landmarker import track_landmarks
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
@@ -37,9 +37,8 @@ SPEECH = (  # shapes, largest weight, Hz
     (("eyeBlinkLeft", "eyeBlinkRight"), 0.8, 0.3),
 )
 CUT = 40.0  # mean grey levels by which the picture changes at a cut
-NO_BUNDLE = Bundle(
-    np.zeros(0, np.int32), *(np.zeros((0, 3), np.float32) for _ in range(3)), np.zeros((0, 4), np.float32)
-)
+EMPTY = np.zeros((0, 3), np.float32)
+NO_BUNDLE = Bundle(np.zeros(0, np.int32), EMPTY, EMPTY, EMPTY, np.zeros((0, 4), np.float32))
 
 
 def camera(size: tuple[int, int], focal: float) -> Camera:
@@ -76,10 +75,11 @@ def talking_head(head: HeadModel, frames: int, seed: int) -> tuple[GroundTruth, 
     pixels += eyes * (0.0035 * jitter / jitter.std() + 0.006 * rng.normal(size=pixels.shape[1:]))
     points = np.zeros((frames, POINTS, 3), np.float32)
     points[:, head.landmark_embedding.landmarks] = np.dstack([pixels, seen[..., 2] * FOCAL / DISTANCE_M])
-    face = head.regions["face"]
+    face = np.sort(head.regions["face"])
     neutral = head.vertices(identity, np.zeros_like(expression[0]))[face]
     truth = GroundTruth(
         neutral=neutral.astype(np.float64),
+        faces=np.searchsorted(face, head.faces[np.isin(head.faces, face).all(1)]).astype(np.int32),
         displacement=np.tensordot(expression, head.expression_basis[:, face], axes=1),
         rotation=matrix,
         translation=translation,
@@ -148,7 +148,9 @@ def consistency(track: Track, landmarks: Landmarks) -> dict[str, float]:
 
 def detected(path: Path, seconds: float = 60.0) -> tuple[Landmarks, NDArray[np.int32]]:
     """Landmarks of the first seconds of a video, and the number of each frame's shot."""
-    frames, cuts, shot = [], set(), [0]
+    frames: list[tuple[float, NDArray[np.uint8]]] = []
+    cuts: set[int] = set()
+    shot = [0]
     for now, rgb in read_frames(path, max_side=1280):
         if now > seconds:
             break

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import kornia.geometry as kg
 import numpy as np
@@ -260,7 +260,7 @@ class Energy:
         o = np.zeros_like(z)
         return np.stack([1 / z, o, -x / z**2, o, 1 / z, -y / z**2], -1).reshape(*z.shape, 2, 3) * self.focal
 
-    def _with_pairs(self, rows: F64) -> F64:
+    def _with_pairs(self, rows: NDArray[Any]) -> NDArray[Any]:
         """[n, L, ..] of landmarks, continued by the differences of the pairs: [n, L+Q, ..]."""
         upper, lower = self.model.pairs.T
         return np.concatenate([rows, rows[:, upper] - rows[:, lower]], axis=1)
