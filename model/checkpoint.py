@@ -141,7 +141,7 @@ class Checkpoint:
             "schedule": self.schedule,
             "parametrization": self.parametrization,
         }
-        write_atomically(path, save(tensors, metadata))
+        write_atomically(path, serialize(tensors, metadata))
 
     @classmethod
     def load(cls, path: Path, *, topology: str | None = None, encoder: str | None = None) -> Checkpoint:
@@ -222,6 +222,15 @@ def _assemble(tensors: dict[str, Tensor], metadata: dict[str, str]) -> Checkpoin
     )
     checkpoint.model()  # every weight is there and has its shape
     return checkpoint
+
+
+def serialize(tensors: State, metadata: dict[str, str]) -> bytes:
+    """A safetensors file whose bytes depend on its content only: the library writes metadata in any order."""
+    content = save(tensors, metadata)
+    start = 8 + int.from_bytes(content[:8], "little")
+    header = json.dumps(json.loads(content[8:start]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return len(header).to_bytes(8, "little") + header + content[start:]
 
 
 def write_atomically(path: Path, content: bytes) -> None:

@@ -154,7 +154,7 @@ class Network(nn.Module):
         """x [N, *b, K] standardized, steps and style integers broadcasting to [*b] -> [N, *b, K]; N even,
         >= 4.
         """
-        h = F.silu(self.encoder(x)) + self.step(sinusoidal(steps, self.config.channels))
+        h = F.silu(self.encoder(x)) + self.step(sinusoidal(steps, self.config.channels).to(x.dtype))
         h = F.silu(self.full(h) + condition.full)
         h = F.silu(self.down(h))
         h = F.silu(self.middle(h))

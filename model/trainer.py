@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save
 from torch import Tensor
 
-from model.checkpoint import Checkpoint, State, read_tensors, write_atomically
+from model.checkpoint import Checkpoint, State, read_tensors, serialize, write_atomically
 from model.dataset import Batch, Crops, Sequence
 from model.diffusion import Diffusion, Progress
 from model.errors import ModelError
@@ -212,7 +211,7 @@ class Trainer:
                 tensors[f"adam.{index}.{name}"] = value
         tensors["losses"] = torch.tensor(self._losses, dtype=torch.float64)
         metadata = {"step": str(self.step), "settings": self._settings()}
-        write_atomically(self.folder / STATE_FILE, save(tensors, metadata))
+        write_atomically(self.folder / STATE_FILE, serialize(tensors, metadata))
 
     def _restore(self) -> None:
         path = self.folder / STATE_FILE

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
-from model.checkpoint import Checkpoint
+from model.checkpoint import Checkpoint, State
 from model.dataset import Sequence, Standardization
 
 K, D, W = 6, 20, 12
+REGIONS = {
+    "lips": np.arange(6, dtype=np.int32),
+    "face": np.arange(D, dtype=np.int32),
+    "inner_lip_upper": np.array([0, 1, 2], np.int32),
+    "inner_lip_lower": np.array([0, 3, 2], np.int32),
+}
+FACES = np.array([[i, i + 1, i + 2] for i in range(D - 2)], np.int32)
 
 
 def basis(seed: int = 0) -> np.ndarray:
@@ -36,15 +44,24 @@ def sequence(frames: int, seed: int, style: int = 0, uncertain: float = 0.3) -> 
 
 def checkpoint(sequences: list[Sequence], parametrization: str = "skip", styles: int = 1) -> Checkpoint:
     """Untrained, fitting the sequences."""
-    faces = np.array([[i, i + 1, i + 2] for i in range(D - 2)], np.int32)
     return Checkpoint.initial(
         kind="base",
         encoder="test",
         styles=tuple(f"person{i}" for i in range(styles)),
         basis=basis(),
         template=np.zeros((D, 3), np.float32),
-        faces=faces,
+        faces=FACES,
         standardization=Standardization.of(sequences),
-        regions={"lips": np.arange(5, dtype=np.int32), "face": np.arange(D, dtype=np.int32)},
+        regions=REGIONS,
         parametrization=parametrization,
     )
+
+
+def shaken(untrained: Checkpoint, seed: int = 0) -> Checkpoint:
+    """With every weight moved at random: a network whose output depends on all of its inputs."""
+    generator = torch.Generator().manual_seed(seed)
+    state: State = {
+        name: value + 0.2 * torch.randn(value.shape, generator=generator) / max(value.shape[0], 8) ** 0.5
+        for name, value in untrained.network.items()
+    }
+    return untrained.with_weights(state, {name: value.clone() for name, value in state.items()})

@@ -1,0 +1,131 @@
+"""Training: it learns, repeats itself, goes on after a kill as if nothing had happened, and says when it diverges."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from model.checkpoint import Checkpoint
+from model.errors import ModelError
+from model.metrics import score
+from model.synthesis import synthesize
+from model.trainer import LOG_FILE, STATE_FILE, Trainer, TrainingConfig, TrainingDivergedError
+from tests.model import talker
+
+TINY = TrainingConfig(iterations=24, batch=4, frames=12, candidates=3, log_every=5, threads=1)
+
+
+def start() -> tuple[Checkpoint, list]:
+    sequences = [talker.sequence(120, 0), talker.sequence(90, 1, style=1)]
+    return talker.checkpoint(sequences, styles=2), sequences
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    loaded = Checkpoint.load(path)
+    return {f"n.{k}": v for k, v in loaded.network.items()} | {f"e.{k}": v for k, v in loaded.ema.items()}
+
+
+def assert_equal(first: Path, second: Path) -> None:
+    ours, theirs = weights(first), weights(second)
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+class Killed(Exception):  # noqa: N818
+    """Stands for a kill."""
+
+
+@pytest.mark.parametrize("step", [5, 15])
+def test_a_killed_training_goes_on_bit_for_bit(tmp_path: Path, step: int) -> None:
+    checkpoint, sequences = start()
+
+    def kill(done: int, total: int) -> None:
+        if done == step:
+            raise Killed
+
+    every_step = replace(TINY, save_seconds=0.0)
+    whole = Trainer(checkpoint, sequences, tmp_path / "whole", TINY).train()
+    with pytest.raises(Killed):
+        Trainer(checkpoint, sequences, tmp_path / "killed", every_step).train(kill)
+    continued = Trainer(checkpoint, sequences, tmp_path / "killed", TINY)
+    assert continued.step == step - 1  # the save after step `step` was not reached
+    again = continued.train()
+    assert [path.name for path in again] == [f"candidate_{n:08d}.safetensors" for n in (8, 16, 24)]
+    for first, second in zip(whole, again, strict=True):
+        assert_equal(first, second)
+    logs = [(tmp_path / name / LOG_FILE).read_text() for name in ("whole", "killed")]
+    assert logs[0] == logs[1] and logs[0].count("\n") == 6
+
+
+def test_a_finished_training_is_not_done_again(tmp_path: Path) -> None:
+    checkpoint, sequences = start()
+    paths = Trainer(checkpoint, sequences, tmp_path, TINY).train()
+    before = [path.read_bytes() for path in paths]
+    assert Trainer(checkpoint, sequences, tmp_path, TINY).train() == paths
+    assert [path.read_bytes() for path in paths] == before
+
+
+def test_the_seed_decides(tmp_path: Path) -> None:
+    checkpoint, sequences = start()
+    last = [
+        Trainer(checkpoint, sequences, tmp_path / name, replace(TINY, seed=seed)).train()[-1]
+        for name, seed in (("a", 0), ("b", 0), ("c", 1))
+    ]
+    assert_equal(last[0], last[1])
+    assert not torch.equal(weights(last[0])["n.decoder.weight"], weights(last[2])["n.decoder.weight"])
+
+
+def test_it_starts_from_a_checkpoint_file_as_from_memory(tmp_path: Path) -> None:
+    """A file keeps no order of its tensors, and the average must still follow each its own."""
+    checkpoint, sequences = start()
+    checkpoint.save(tmp_path / "base")
+    first = Trainer(checkpoint, sequences, tmp_path / "memory", TINY).train()[-1]
+    second = Trainer(Checkpoint.load(tmp_path / "base"), sequences, tmp_path / "file", TINY).train()[-1]
+    assert_equal(first, second)
+
+
+def test_a_state_of_another_training_is_refused(tmp_path: Path) -> None:
+    checkpoint, sequences = start()
+    Trainer(checkpoint, sequences, tmp_path, TINY).train()
+    with pytest.raises(ModelError, match="other settings or data"):
+        Trainer(checkpoint, sequences, tmp_path, replace(TINY, learning_rate=1e-3))
+    with pytest.raises(ModelError, match="other settings or data"):
+        Trainer(checkpoint, sequences[:1], tmp_path, TINY)
+    Trainer(checkpoint, sequences, tmp_path, replace(TINY, threads=2, log_every=7))  # changes no result
+    (tmp_path / STATE_FILE).write_bytes(b"half")
+    with pytest.raises(ModelError, match="not a readable"):
+        Trainer(checkpoint, sequences, tmp_path, TINY)
+
+
+def test_divergence_names_the_iteration_and_keeps_what_was_good(tmp_path: Path) -> None:
+    checkpoint, sequences = start()
+    config = replace(TINY, learning_rate=10.0, candidates=24)
+    with pytest.raises(TrainingDivergedError, match=r"diverged at iteration (5|10|15|20|24) "):
+        Trainer(checkpoint, sequences, tmp_path, config).train()
+    assert (tmp_path / "candidate_00000001.safetensors").exists()
+
+
+def test_the_number_of_threads_comes_back(tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    Trainer(*start(), tmp_path, replace(TINY, threads=before + 1, iterations=1, candidates=1)).train()
+    assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("parametrization", ["skip", "plain"])
+def test_what_it_learns_beats_the_mean_on_unseen_motion(tmp_path: Path, parametrization: str) -> None:
+    train, unseen = talker.sequence(900, 0), talker.sequence(300, 1)
+    config = TrainingConfig(
+        iterations=300, batch=16, frames=16, learning_rate=3e-3, ema=0.98, candidates=1, threads=1
+    )
+    path = Trainer(talker.checkpoint([train], parametrization), [train], tmp_path, config).train()[-1]
+    learned = Checkpoint.load(path)
+    drawn = synthesize(learned, unseen.features, guidance=1.0, rule="ddim", steps=25, samples=2)
+    mean = np.broadcast_to(train.coefficients.mean(0), (1, *unseen.coefficients.shape))
+    ours, baseline = score(drawn, unseen, learned), score(mean, unseen, learned)
+    for name in ("lip_sync", "l2_lip", "l2_face"):
+        assert ours[name] < 0.9 * baseline[name], name
+    assert ours["lip_gap_r"] > 0.7 and 0.6 < ours["spread"] < 1.3 and ours["velocity"] < 2.0
