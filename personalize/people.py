@@ -19,12 +19,13 @@ PATCH = 64  # px, side of the face for light and sharpness
 MIN_OVERLAP = 0.3  # intersection over union of a face's boxes from one picture to the next
 MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
 SAMPLE_S = 0.6  # time between two looks at the face's shape
-MIN_PRESENCE = (
-    0.5  # of the landmarker: what the detector takes for a face but the landmarker does not is none
-)
+MIN_PRESENCE = 0.5  # of the landmarker: what it does not take for a face is none, whatever the detector says
 SEARCH_S = 1.0  # between searches for small faces in tiles while none is seen
-# Distance of two people's face shapes, both scaled to norm 1; see `shape_distance`.
-OTHER_PERSON = 0.05
+PORTRAIT = (12, 14)  # px, width and height of the grey picture that people are told apart by
+# Between 20 people (GRID and four more, 3 s each) a threshold of 2 takes 1 % of pairs for the same person and
+# no pair of one person's shots for two.
+SHAPE_SCALE, PORTRAIT_SCALE, OTHER_PERSON = 0.05, 0.25, 2.0
+SEEDS = 5  # largest tracklets tried as the main person
 
 
 @dataclass(eq=False)
@@ -32,7 +33,7 @@ class Tracklet:
     """One face followed through one shot. The lists hold an entry a frame, but for `shapes`.
 
     frames: indices. times: s. boxes: [4] px. eyes: px between the eyes. light: mean grey level of the face.
-    sharpness: see `sharpness`. shapes: landmarks [478, 3] px of a frame every SAMPLE_S.
+    sharpness: see `sharpness`. shapes: landmarks [478, 3] px, and portraits: PORTRAIT, of a frame every SAMPLE_S.
     """
 
     segment: int
@@ -43,6 +44,7 @@ class Tracklet:
     light: list[float] = field(default_factory=list)
     sharpness: list[float] = field(default_factory=list)
     shapes: list[F32] = field(default_factory=list)
+    portraits: list[U8] = field(default_factory=list)
     next_sample: float = -1.0
 
     @property
@@ -106,6 +108,7 @@ class FaceFollower:
         points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
         if presence >= MIN_PRESENCE:
             tracklet.shapes.append(points)
+            tracklet.portraits.append(_portrait(rgb, points))
 
 
 def _face_patch(rgb: U8, box: F32) -> U8:
@@ -115,6 +118,20 @@ def _face_patch(rgb: U8, box: F32) -> U8:
     part = part if part.size else np.zeros((1, 1, 3), np.uint8)
     small = cv2.resize(part, (PATCH, PATCH), interpolation=cv2.INTER_AREA)
     return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+
+
+def _portrait(rgb: U8, points: F32) -> U8:
+    """The head with its hair as a grey picture of size PORTRAIT, eyes and mouth always at the same places."""
+    features = np.stack([points[i, :2].mean(0) for i in ((33, 133), (362, 263), (61, 291))])
+    places = np.array([[22, 30], [42, 30], [32, 52]], np.float32)
+    to_portrait, _ = cv2.estimateAffinePartial2D(features, places)
+    if to_portrait is None:  # points that coincide
+        return np.zeros(PORTRAIT[::-1], np.uint8)
+    blur = 0.5 / max(float(np.sqrt(abs(np.linalg.det(to_portrait[:, :2])))), 1e-3)
+    head = cv2.warpAffine(
+        cv2.GaussianBlur(rgb, (0, 0), blur), to_portrait, (64, 72), borderMode=cv2.BORDER_REPLICATE
+    )
+    return cv2.cvtColor(cv2.resize(head, PORTRAIT, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
 
 
 def sharpness(grey: U8) -> float:
@@ -130,7 +147,7 @@ def _overlap(a: F32, b: F32) -> float:
 
 
 def align(shapes: F64, reference: F64) -> F64:
-    """Shapes [N, 478, 3] centred, scaled to norm 1 and turned onto `reference` [478, 3], which is so already."""
+    """Shapes [N, 478, 3] centred, scaled to norm 1 and turned onto `reference` [478, 3]."""
     shapes = shapes - shapes.mean(1, keepdims=True)
     shapes = shapes / np.sqrt((shapes**2).sum((1, 2), keepdims=True))
     u, _, vt = np.linalg.svd(np.einsum("nki,kj->nij", shapes, reference))
@@ -138,30 +155,49 @@ def align(shapes: F64, reference: F64) -> F64:
     return np.einsum("nki,nij->nkj", shapes, u @ vt)
 
 
-def shape_distance(tracklet: Tracklet, reference: F64) -> float:
-    """Distance of a tracklet's median face shape from `reference` [478, 3], both of norm 1."""
-    shape = np.median(align(np.asarray(tracklet.shapes, np.float64), reference), axis=0)
-    return float(np.linalg.norm(shape - reference))
+@dataclass(frozen=True)
+class Look:
+    """How one person looks: median landmarks [478, 3] of norm 1 in one pose, median PORTRAIT of norm 1."""
+
+    shape: F64
+    portrait: F64
+
+    @classmethod
+    def of(cls, tracklet: Tracklet, pose: F64) -> Look:
+        """The look of a tracklet that has samples; `pose`: landmarks [478, 3] to turn its landmarks onto."""
+        shape = np.median(align(np.asarray(tracklet.shapes, np.float64), pose), axis=0)
+        portrait = np.median(np.asarray(tracklet.portraits, np.float64), axis=0)
+        portrait -= portrait.mean()
+        return cls(shape / np.linalg.norm(shape), portrait / max(float(np.linalg.norm(portrait)), 1e-9))
+
+    def distance(self, other: Look) -> float:
+        """Under OTHER_PERSON for one person: difference of the shapes, and lack of correlation of the portraits."""
+        shape = float(np.linalg.norm(self.shape - other.shape))
+        return shape / SHAPE_SCALE + (1 - float((self.portrait * other.portrait).sum())) / PORTRAIT_SCALE
 
 
 def main_person(tracklets: list[Tracklet]) -> tuple[list[Tracklet], list[Tracklet]]:
     """(tracklets of the person who is most in the picture, those of others). What is no face is in neither."""
     faces = [t for t in tracklets if t.shapes]
-    if not faces:
-        return [], []
     best: list[Tracklet] = []
-    for seed in sorted(faces, key=lambda t: -t.weight)[:5]:
-        reference = np.asarray(seed.shapes[len(seed.shapes) // 2], np.float64)
-        reference = align(reference[None], reference)[0]
-        reference = np.median(align(np.asarray(seed.shapes, np.float64), reference), axis=0)
-        reference /= np.linalg.norm(reference)
-        distance = {id(t): shape_distance(t, reference) for t in faces}
-        same: list[Tracklet] = []
-        # Nobody is in two places at once: of faces seen together the most alike is the person.
-        for t in sorted(faces, key=lambda t: distance[id(t)]):
-            if distance[id(t)] < OTHER_PERSON and not any(set(t.frames) & set(s.frames) for s in same):
-                same.append(t)
+    for seed in sorted(faces, key=lambda t: -t.weight)[:SEEDS]:
+        same = _same_person(seed, faces)
+        # The one found first, in the largest tracklet, unless another is clearly more in the picture.
         if sum(t.weight for t in same) > 1.05 * sum(t.weight for t in best):
             best = same
     mine = {id(t) for t in best}
     return best, [t for t in faces if id(t) not in mine]
+
+
+def _same_person(seed: Tracklet, faces: list[Tracklet]) -> list[Tracklet]:
+    """Tracklets that look like `seed`. Nobody is in two places at once: of faces seen together, the most alike."""
+    pose = np.asarray(seed.shapes[0], np.float64)
+    look = Look.of(seed, pose)
+    distances = [look.distance(Look.of(t, pose)) for t in faces]
+    same: list[Tracklet] = []
+    taken: set[int] = set()
+    for i in np.argsort(distances, kind="stable"):
+        if distances[i] < OTHER_PERSON and taken.isdisjoint(faces[i].frames):
+            same.append(faces[i])
+            taken.update(faces[i].frames)
+    return same
