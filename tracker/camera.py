@@ -24,6 +24,7 @@ from tracker.track import F64, Bundle, Camera, Landmarks
 PRIOR_FOCAL = 1.3  # of the picture's long side: phones and webcams .7-1.2, camcorders and portraits 1.2-2.5
 PRIOR_SD_LOG = 0.35
 FOCAL_RANGE = (0.6, 5.0)  # of the long side
+SECOND_START = 1.6  # times the prior's: the adjustment must come to the same focal length from there
 MIN_TURN_DEG = 8.0  # a head that turns less leaves focal length and depth undecided
 OUTLIER = (
     0.08  # of the distance between the outer eye corners: farther landmarks do not count for a frame's pose
@@ -55,15 +56,32 @@ def estimate_camera(
     prior = _camera(landmarks.size, focal_given)
     tracks = track_features(frames(), landmarks, usable, segments, progress)
     start = _start(tracks, landmarks, head, prior)
-    model = camera_model(prior.focal_px, prior.principal_px, prior.size)
-    found = adjust(start, model, refine_focal=focal_given is None) if len(start.observations) else None
+    found = _adjust(start, prior, refine_focal=focal_given is None) if len(start.observations) else None
     if found is None:
         return prior, _bundle(start)
     scene, focal, formal = found
     camera = prior
-    if focal_given is None:
-        camera = _joined(prior, focal, _focal_sd_log(scene, focal, formal, prior), _turn_deg(scene))
+    if focal_given is None and _tells_depth(scene, start):
+        sd_log = _focal_sd_log(scene, focal, formal, prior)
+        camera = _joined(prior, focal, float(np.hypot(sd_log, _start_dependence(start, prior, focal))))
     return camera, _bundle(_final(scene, start, focal, camera))
+
+
+def _adjust(scene: RigidScene, camera: Camera, refine_focal: bool) -> tuple[RigidScene, float, float] | None:
+    return adjust(scene, camera_model(camera.focal_px, camera.principal_px, camera.size), refine_focal)
+
+
+def _tells_depth(scene: RigidScene, start: RigidScene) -> bool:
+    """Whether the head turns and most points end up near the mean head; noise takes those of a still head away."""
+    _, loose = _settled(scene, start)
+    return _turn_deg(scene) >= MIN_TURN_DEG and bool(loose.mean() < 0.5)
+
+
+def _start_dependence(start: RigidScene, camera: Camera, focal: float) -> float:
+    """How far log(focal) moves when the adjustment begins from another focal length: nothing where it is known."""
+    there = replace(camera, focal_px=SECOND_START * camera.focal_px)
+    again = _adjust(_scaled(start, SECOND_START), there, refine_focal=True)
+    return abs(float(np.log(again[1] / focal))) if again is not None else np.inf
 
 
 def _camera(size: tuple[int, int], focal_given: float | None) -> Camera:
@@ -85,10 +103,10 @@ def _camera(size: tuple[int, int], focal_given: float | None) -> Camera:
     )
 
 
-def _joined(prior: Camera, focal: float, sd_log: float, turn_deg: float) -> Camera:
+def _joined(prior: Camera, focal: float, sd_log: float) -> Camera:
     """Prior and bundle joined in log space, or the prior alone where the bundle tells less than it."""
     low, high = (bound * max(prior.size) for bound in FOCAL_RANGE)
-    if turn_deg < MIN_TURN_DEG or sd_log >= PRIOR_SD_LOG or not low <= focal <= high:
+    if sd_log >= PRIOR_SD_LOG or not low <= focal <= high:
         return prior
     weight, prior_weight = sd_log**-2, PRIOR_SD_LOG**-2
     log_focal = (weight * np.log(focal) + prior_weight * np.log(prior.focal_px)) / (weight + prior_weight)
@@ -186,13 +204,17 @@ def _pruned(scene: RigidScene) -> RigidScene:
     )
 
 
+def _scaled(scene: RigidScene, factor: float) -> RigidScene:
+    """The scene for a focal longer by `factor`: as far again from the camera."""
+    return replace(scene, translation=scene.translation * (1, 1, factor))
+
+
 def _final(scene: RigidScene, start: RigidScene, focal: float, camera: Camera) -> RigidScene:
     """The scene, adjusted with a free focal, once more under the final camera and in the mean head's frame.
 
     Where a window's head is too still to tell its shape, the points stay on the mean head.
     """
-    factor = camera.focal_px / focal
-    settled, loose = _settled(replace(scene, translation=scene.translation * (1, 1, factor)), start)
+    settled, loose = _settled(_scaled(scene, camera.focal_px / focal), start)
     model = camera_model(camera.focal_px, camera.principal_px, camera.size)
     found = adjust(settled, model, refine_focal=False, fixed=loose)
     return _settled(found[0], start)[0] if found is not None else settled
