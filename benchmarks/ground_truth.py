@@ -24,7 +24,7 @@ NORMAL_M = 0.01  # two points whose normals differ by a unit count as this far a
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Of T frames: neutral [V, 3], faces [F, 3], displacement [T, V, 3] m, pose to the OpenCV camera, lip_gap_mm [T]."""
+    """T frames: neutral [V, 3] and displacement [T, V, 3] m, faces [F, 3], pose to the OpenCV camera, lip_gap_mm."""
 
     neutral: F64
     faces: NDArray[np.int32]
