@@ -19,7 +19,7 @@ from personalize.shots import (
     REASONS,
     THUMBNAIL,
     Frames,
-    differences,
+    difference,
     find_shots,
     usable_seconds,
 )
@@ -33,10 +33,21 @@ MIN_USABLE_S = 10.0  # less is refused: fine-tuned on 5 s the model diverges
 GOOD_USABLE_S = 30.0  # less gives a warning
 MIN_EYES_PX = 20.0  # between the eyes; below, lip motion is lost in the landmarks' jitter
 GOOD_EYES_PX = 45.0
-MIN_LIGHT = 20.0  # mean grey level of the face
-MIN_SHARPNESS = 0.1  # see people.sharpness
+MIN_LIGHT, GOOD_LIGHT = 15.0, 35.0  # mean grey level of the face
+MIN_SHARPNESS = 0.2  # see people.sharpness: blocky or noisy video has 0.3 to 0.6
 SILENCE = 1e-3  # peak of the sound, -60 dB
 MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it for no longer
+
+DESCRIPTIONS = {
+    "no_face": "no face is seen",
+    "cut": "cuts and shots too short to track",
+    "other_person": "another person's face, or something covers it",
+    "too_small": "the face is too small",
+    "too_dark": "the face is too dark",
+    "blurred": "the face is blurred",
+    "corrupt": "damaged in the file",
+    "duplicate": "the picture stands still",
+}
 
 
 @dataclass(frozen=True)
@@ -82,8 +93,7 @@ def _read_sound(media: MediaInfo) -> tuple[NDArray[np.float32], float]:
 
 def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, list[str]]:
     """Frames of a video with their reasons, and warnings. Two passes: shots first, then faces."""
-    time, thumbnails, corrupt = _thumbnails(media, progress)
-    change, same = differences(thumbnails)
+    time, change, same, corrupt = _look_for_cuts(media, progress)
     segment = find_shots(time, change)
     mine, others = main_person(_follow_faces(media, segment, progress))
     total = len(time)
@@ -93,8 +103,9 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     measures = np.full((total, 7), np.nan, np.float32)  # box, eyes, light, sharpness
     for tracklet in mine:
         rows = _filled(tracklet, time)
-        reason[tracklet.frames[0] : tracklet.frames[-1] + 1][~np.isnan(rows[:, 0])] = 0
-        measures[tracklet.frames[0] : tracklet.frames[-1] + 1] = rows
+        known = tracklet.frames[0] + np.flatnonzero(~np.isnan(rows[:, 0]))
+        reason[known] = 0
+        measures[known] = rows[known - tracklet.frames[0]]
     scale = max(1.0, max(media.width, media.height) / SEARCH_SIDE)
     box, eyes, light, sharp = measures[:, :4] * scale, measures[:, 4] * scale, measures[:, 5], measures[:, 6]
     seen = reason == 0
@@ -109,22 +120,26 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     for name, marked in marks.items():  # the last that applies stays
         reason[marked] = REASONS.index(name)
     frames = Frames(time, reason == 0, reason, REASONS, segment, box.astype(np.float32))
-    return frames, _warnings(frames, eyes)
+    return frames, _warnings(frames, eyes, light)
 
 
-def _thumbnails(
+def _look_for_cuts(
     media: MediaInfo, progress: Progress
-) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.bool_]]:
-    """First pass: times [T] s, grey thumbnails [T, h, w], and which pictures are damaged [T]."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """First pass: times [T] s, how much each picture differs from the last [T], repeated [T], damaged [T]."""
     reader = read_frames(media.path, THUMBNAIL)
     expected = max(1, round(media.duration_s * media.fps))
     rows = []
+    last: NDArray[np.uint8] | None = None
     for time, rgb in reader:
-        rows.append((time, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), reader.damaged))
+        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        change, repeated = difference(grey, last) if last is not None else (0.0, False)
+        rows.append((time, change, repeated, reader.damaged))
+        last = grey
         if progress is not None:
             progress(min(len(rows), expected), 2 * expected)
-    times, thumbnails, damaged = zip(*rows)
-    return np.array(times), np.stack(thumbnails), np.array(damaged)
+    times, changes, same, damaged = zip(*rows)
+    return np.array(times), np.array(changes), np.array(same), np.array(damaged)
 
 
 def _follow_faces(media: MediaInfo, segment: NDArray[np.int32], progress: Progress) -> list[Tracklet]:
@@ -160,33 +175,23 @@ def _cut(time: NDArray[np.float64], segment: NDArray[np.int32]) -> NDArray[np.bo
     return first | (length[segment] < MIN_SHOT_S)
 
 
-def _warnings(frames: Frames, eyes: NDArray[np.float32]) -> list[str]:
+def _warnings(frames: Frames, eyes: NDArray[np.float32], light: NDArray[np.float32]) -> list[str]:
+    """What the person should know of a clip that is used all the same."""
     texts = []
     total = len(frames.time)
     for number, name in enumerate(REASONS[1:], 1):
         share = float((frames.reason == number).mean())
-        if share > 0.05:
-            texts.append(f"{share:.0%} of {total} frames left out: {DESCRIPTIONS[name]}")
-    if frames.usable.any() and float(np.median(eyes[frames.usable])) < GOOD_EYES_PX:
-        size = float(np.median(eyes[frames.usable]))
-        texts.append(f"the face is small ({size:.0f} px between the eyes): lips will be measured coarsely")
-    if (frames.reason == REASONS.index("corrupt")).any():
-        texts.append(
-            f"{int((frames.reason == REASONS.index('corrupt')).sum())} frames are damaged in the file"
-        )
+        if share > 0.05 or (share > 0 and name == "corrupt"):
+            texts.append(f"{share:.1%} of {total} frames left out: {DESCRIPTIONS[name]}")
+    if frames.usable.any():
+        size, level = float(np.median(eyes[frames.usable])), float(np.median(light[frames.usable]))
+        if size < GOOD_EYES_PX:
+            texts.append(
+                f"the face is small ({size:.0f} px between the eyes): lips will be measured coarsely"
+            )
+        if level < GOOD_LIGHT:
+            texts.append("the face is dark: more light would make the tracking steadier")
     return texts
-
-
-DESCRIPTIONS = {
-    "no_face": "no face is seen",
-    "cut": "cuts and shots too short to track",
-    "other_person": "another person's face",
-    "too_small": "the face is too small",
-    "too_dark": "the face is too dark",
-    "blurred": "the face is blurred",
-    "corrupt": "damaged in the file",
-    "duplicate": "the picture stands still",
-}
 
 
 def _too_little(media: MediaInfo, frames: Frames, seconds: float) -> str:

@@ -48,17 +48,14 @@ class Frames:
     box: F32
 
 
-def differences(thumbnails: U8) -> tuple[F64, Bool]:
-    """How each of [T, h, w] grey pictures differs from the one before: (mean [T], is it the same picture [T])."""
-    mean, same = np.zeros(len(thumbnails)), np.zeros(len(thumbnails), bool)
-    for i in range(1, len(thumbnails)):
-        change = np.abs(thumbnails[i].astype(np.int16) - thumbnails[i - 1])
-        mean[i], same[i] = change.mean(), change.max() <= SAME_LEVEL
-    return mean, same
+def difference(grey: U8, last: U8) -> tuple[float, bool]:
+    """How a grey picture [h, w] differs from the one before: (mean grey levels, whether it is repeated)."""
+    change = np.abs(grey.astype(np.int16) - last)
+    return float(change.mean()), bool(change.max() <= SAME_LEVEL)
 
 
 def find_shots(time: F64, change: F64) -> NDArray[np.int32]:
-    """Number [T] of the uninterrupted shot of each frame, after `change` [T] of `differences`."""
+    """Number [T] of the uninterrupted shot of each frame, after its `change` [T] (see `difference`)."""
     step = np.diff(time, prepend=time[0] - 1.0)
     typical = float(np.median(step[1:])) if len(time) > 1 else 1.0
     # Pictures that are further apart differ more without any cut.

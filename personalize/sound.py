@@ -46,10 +46,9 @@ def read_audio(path: Path | str, rate: int = AUDIO_RATE) -> tuple[F32, float]:
     if not runs:
         return np.zeros(0, np.float32), 0.0
     first = min(start for start, _ in runs)
-    end = max(start + len(part) / rate for start, part in runs)
-    samples = np.zeros(round((end - first) * rate) + 1, np.float32)
-    for start, part in runs:
-        place = round((start - first) * rate)
+    placed = [(round((start - first) * rate), part) for start, part in runs]
+    samples = np.zeros(max(place + len(part) for place, part in placed), np.float32)
+    for place, part in placed:
         samples[place : place + len(part)] = part
     return samples, first
 

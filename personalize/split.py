@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from personalize.shots import F64, Frames, covered, usable_seconds
+from personalize.shots import F64, Bool, Frames, covered, usable_seconds
 
 PARTS = (("train", 0.5), ("val", 0.75), ("test", 1.0))  # each up to this share of the usable time
 GUARD_S = 0.2  # left out on both sides of a boundary inside a shot: neighbouring frames are nearly equal
@@ -33,13 +33,13 @@ def _boundary(frames: Frames, spent: F64, target: float, total: float) -> float:
     """Time of the frame at which `target` s of usable time are spent, or of the first of a shot near it."""
     starts = np.flatnonzero(np.diff(frames.segment, prepend=frames.segment[0]))
     if len(starts):
-        nearest = starts[np.argmin(np.abs(spent[starts] - target))]
+        nearest = int(starts[np.abs(spent[starts] - target).argmin()])
         if abs(spent[nearest] - target) <= SEARCH_SHARE * total:
             return float(frames.time[nearest])
-    return float(frames.time[min(np.searchsorted(spent, target), len(spent) - 1)])
+    return float(frames.time[min(int(np.searchsorted(spent, target)), len(spent) - 1)])
 
 
-def _guarded(frames: Frames, bound: float) -> np.ndarray:
+def _guarded(frames: Frames, bound: float) -> Bool:
     """Frames of the same shot too near to a boundary."""
     index = int(np.searchsorted(frames.time, bound))
     if index == 0 or index >= len(frames.time) or frames.segment[index] != frames.segment[index - 1]:
@@ -47,7 +47,7 @@ def _guarded(frames: Frames, bound: float) -> np.ndarray:
     return np.abs(frames.time - bound) < GUARD_S / 2
 
 
-def _spans(frames: Frames, inside: np.ndarray) -> list[list[float]]:
+def _spans(frames: Frames, inside: Bool) -> list[list[float]]:
     """[start, end] s of the stretches of `inside` [T] that no cut or long gap interrupts."""
     index = np.flatnonzero(inside)
     if not len(index):

@@ -1,0 +1,157 @@
+"""Pictures and sound come at their true times, upright, and files that are no video are refused in one line."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from personalize.errors import UserError
+from personalize.media import VideoWriter, on_video_clock, probe, read_audio, read_frames, write_wav
+from tests.personalize.video_factory import RATE, clicks, corner_picture, moving, write_video
+
+STEADY = [i / 25 for i in range(25)]
+
+
+def click_times(samples: np.ndarray, start: float, rate: int = 16_000) -> list[float]:
+    """Times at which the sound becomes loud after 50 ms of quiet."""
+    loud = np.flatnonzero(np.abs(samples) > 0.3)
+    first = loud[np.diff(loud, prepend=-rate) > rate // 20]
+    return [start + int(i) / rate for i in first]
+
+
+def test_variable_rate_keeps_presentation_times(tmp_path: Path) -> None:
+    times = [0.0, 0.04, 0.12, 0.3, 0.34, 1.0]
+    path = write_video(tmp_path / "v.mkv", moving(6), [t + 2.0 for t in times])
+    assert [t for t, _ in read_frames(path)] == pytest.approx(times, abs=1e-3)
+    assert probe(path).video_start_s == pytest.approx(2.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("rotation", [0, 90, 180, 270])
+def test_rotation_metadata_is_applied(tmp_path: Path, rotation: int) -> None:
+    upright = corner_picture()
+    stored = np.ascontiguousarray(np.rot90(upright, -rotation // 90))
+    path = write_video(tmp_path / "v.mp4", [stored] * 3, STEADY[:3], rotation=rotation)
+    info = probe(path)
+    assert (info.width, info.height) == (96, 64)
+    _, picture = next(read_frames(path))
+    assert np.abs(picture.astype(int) - upright)[4:-4, 4:-4].mean() < 8
+
+
+def test_pixels_that_are_not_square_are_made_so(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mkv", moving(3), STEADY[:3], aspect=Fraction(4, 3))
+    assert (probe(path).width, probe(path).height) == (128, 64)
+    assert next(read_frames(path))[1].shape == (64, 128, 3)
+
+
+def test_ten_bits_and_smaller_pictures(tmp_path: Path) -> None:
+    picture = corner_picture()
+    path = write_video(tmp_path / "v.mkv", [picture] * 3, STEADY[:3], pixels="yuv420p10le")
+    _, read = next(read_frames(path))
+    assert read.dtype == np.uint8 and np.abs(read.astype(int) - picture)[4:-4, 4:-4].mean() < 8
+    assert next(read_frames(path, max_side=48))[1].shape == (32, 48, 3)
+
+
+def test_late_sound_and_gaps_keep_their_times(tmp_path: Path) -> None:
+    sound = clicks([0.1, 0.5, 1.5], 2.0)
+    path = write_video(tmp_path / "v.mkv", moving(25), STEADY, sound, sound_start=0.4, sound_gap=(1.0, 1.6))
+    samples, start = read_audio(path)
+    assert start == pytest.approx(0.4, abs=2e-3)
+    assert click_times(samples, start) == pytest.approx([0.5, 0.9, 1.9], abs=3e-3)
+    clocked = on_video_clock(samples, start, 3.0)
+    assert len(clocked) == 48_000 and click_times(clocked, 0.0) == pytest.approx([0.5, 0.9, 1.9], abs=3e-3)
+
+
+def test_sound_that_begins_before_the_picture_is_cut_on_its_clock() -> None:
+    assert list(on_video_clock(np.arange(6, dtype=np.float32), -0.5, 2.0, rate=4)) == [2, 3, 4, 5, 0, 0, 0, 0]
+
+
+def test_video_without_sound_gives_none(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", moving(5), STEADY[:5])
+    assert not probe(path).has_audio and len(read_audio(path)[0]) == 0
+
+
+def test_wav_keeps_its_samples(tmp_path: Path) -> None:
+    samples = np.linspace(-1, 1, 1000, dtype=np.float32)
+    write_wav(tmp_path / "a.wav", samples)
+    read, start = read_audio(tmp_path / "a.wav")
+    assert start == 0 and np.abs(read - samples).max() < 1e-4
+
+
+def test_damaged_pictures_are_named_until_the_next_key(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 255, (64, 96, 3), dtype=np.uint8) for _ in range(40)]
+    path = write_video(tmp_path / "v.mkv", pictures, [i / 25 for i in range(40)], keys=10)
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 3000] = rng.integers(0, 255, 3000, dtype=np.uint8).tobytes()
+    path.write_bytes(data)
+    reader = read_frames(path)
+    damaged = [reader.damaged for _ in reader]
+    assert len(damaged) >= 20 and not damaged[0]
+    assert any(damaged) or len(damaged) < 40
+    assert not damaged[-1]
+
+
+def _still(path: Path) -> Path:
+    with av.open(str(path), "w", format="image2") as out:
+        stream = out.add_stream("png", rate=1)
+        stream.height, stream.width, stream.pix_fmt = 64, 96, "rgb24"
+        out.mux(stream.encode(av.VideoFrame.from_ndarray(corner_picture(), format="rgb24")))
+        out.mux(stream.encode(None))
+    return path
+
+
+def _text(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_what_is_no_video_is_refused_in_one_line(tmp_path: Path) -> None:
+    write_wav(tmp_path / "sound.wav", clicks([0.1], 1.0), RATE)
+    whole = write_video(tmp_path / "whole.mp4", moving(25), STEADY)
+    (tmp_path / "cut.mp4").write_bytes(whole.read_bytes()[:600])
+    playlist = f"#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n{whole}\n#EXT-X-ENDLIST\n"
+    cases = {
+        tmp_path / "missing.mp4": "no such file",
+        tmp_path: "not a file",
+        _text(tmp_path / "empty.mp4", ""): "empty",
+        _text(tmp_path / "text.mp4", "not a video"): "not a video",
+        _text(tmp_path / "list.m3u8", playlist): "not a video",
+        tmp_path / "cut.mp4": "not a video",
+        tmp_path / "sound.wav": "only sound",
+        _still(tmp_path / "still.png"): "still picture",
+        write_video(tmp_path / "one.mp4", moving(1), [0.0]): "only one picture",
+    }
+    for path, words in cases.items():
+        with pytest.raises(UserError, match=words) as caught:
+            probe(path)
+        assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def test_written_video_reads_back_with_its_sound(tmp_path: Path) -> None:
+    path = tmp_path / "out ü.mp4"
+    pictures = [p[:63, :95] for p in moving(30)]
+    with VideoWriter(path, 30, (95, 63), audio=clicks([0.5], 1.0), audio_rate=RATE) as writer:
+        for i, picture in enumerate(pictures):
+            writer.write(picture, i / 30)
+    read = list(read_frames(path))
+    assert [t for t, _ in read] == pytest.approx([i / 30 for i in range(30)], abs=1e-3)
+    assert read[0][1].shape == (64, 96, 3)
+    assert np.abs(read[7][1][:63, :95].astype(int) - pictures[7]).mean() < 10
+    assert probe(path).pixel_format == "yuv420p" and probe(path).audio_codec == "aac"
+    assert click_times(*read_audio(path))[0] == pytest.approx(0.5, abs=0.01)
+    data = path.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")
+
+
+def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "out.mp4"
+    path.write_bytes(b"earlier")
+    with pytest.raises(RuntimeError), VideoWriter(path, 25, (96, 64)) as writer:
+        writer.write(corner_picture())
+        raise RuntimeError
+    assert path.read_bytes() == b"earlier" and list(tmp_path.iterdir()) == [path]
