@@ -63,8 +63,11 @@ class Truth:
     head: np.str_
 
     def save(self, path: Path) -> None:
-        """Write as npz, one key a field."""
-        np.savez_compressed(path, **asdict(self))
+        """Write as npz, one key a field; whole or not at all."""
+        partial = path.with_name(f".{path.name}.partial")
+        with partial.open("wb") as stream:
+            np.savez_compressed(stream, **asdict(self))
+        partial.replace(path)
 
     @classmethod
     def load(cls, path: Path) -> Truth:

@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from personalize.media import read_frames
-from personalize.talkers.film import DEMO_DISTANCE_M, Truth, demo_identity, render_talker
+from personalize.talkers.film import ASSETS, DEMO_DISTANCE_M, Truth, demo_identity, render_talker
 from personalize.talkers.motion import FACING, talker_motion
 from personalize.talkers.style import Style
 from personalize.talkers.visemes import ARKIT_NAMES, BILABIALS, VISEMES, Phone, load_phones
 from tracker.head import load_head
 from tracker.raster import project
 
-DEMO_PHONES = Path("personalize/assets/demo_speech.json")
+DEMO_PHONES = ASSETS / "demo_speech.json"
 SENTENCE = [
     Phone(name, 0.12 * index, 0.12 * (index + 1))
     for index, name in enumerate(["SIL", "M", "AA", "P", "IY", "B", "UW", "AE", "F", "OY", "S", "SIL"])
@@ -23,7 +23,7 @@ SENTENCE = [
 
 @pytest.fixture(scope="module")
 def demo_phones() -> list[Phone]:
-    return load_phones(Path(__file__).parents[2] / DEMO_PHONES)
+    return load_phones(DEMO_PHONES)
 
 
 def test_demo_phones_follow_one_another(demo_phones: list[Phone]) -> None:
