@@ -95,9 +95,13 @@ def adjust(
     if not refine_focal:
         config.set_constant_cam_intrinsics(1)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(_options(refine_focal), config, world)
-    if not adjuster.solve().is_solution_usable():
+    try:
+        usable = adjuster.solve().is_solution_usable()
+    except (RuntimeError, ValueError):  # its own checks of a problem it cannot take
         return None
     focal = float(world.cameras[1].params[0])
+    if not usable or not 0 < focal < np.inf:
+        return None
     formal = 0.0
     if refine_focal:
         covariance = pycolmap.estimate_ba_covariance(
