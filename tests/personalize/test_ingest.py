@@ -1,0 +1,133 @@
+"""Shots, people, usable time and the split; on whole clips where shared ones are there."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from personalize.errors import UserError
+from personalize.ingest import MIN_USABLE_S, find_usable, ingest_video
+from personalize.media import probe
+from personalize.people import Tracklet, main_person
+from personalize.shots import REASONS, Frames, difference, find_shots, usable_seconds
+from personalize.split import make_split
+from tests.personalize.video_factory import RATE, clicks, moving, write_video
+
+
+def frames_of(time: np.ndarray, usable: np.ndarray, segment: np.ndarray | None = None) -> Frames:
+    shots = np.zeros(len(time), np.int32) if segment is None else segment.astype(np.int32)
+    box = np.zeros((len(time), 4), np.float32)
+    return Frames(time, usable, (~usable).astype(np.uint8), REASONS, shots, box)
+
+
+def test_a_cut_is_found_where_the_change_stands_out() -> None:
+    change = 0.5 + 0.2 * np.sin(np.arange(100.0))
+    change[[30, 33, 70]] = 8.0
+    shots = find_shots(np.arange(100) / 25, change)
+    assert list(np.flatnonzero(np.diff(shots)) + 1) == [30, 33, 70]
+
+
+def test_steady_strong_motion_is_no_cut() -> None:
+    change = np.random.default_rng(0).uniform(4, 8, 200)
+    assert find_shots(np.arange(200) / 25, change).max() == 0
+
+
+def test_a_missing_second_ends_a_shot_and_a_dropped_frame_does_not() -> None:
+    time = np.concatenate([np.arange(25) / 25, 2 + np.arange(25) / 25])
+    time = np.delete(time, 40)
+    change = np.full(len(time), 1.0)
+    change[40] = 2.2  # two steps at once
+    assert list(np.flatnonzero(np.diff(find_shots(time, change))) + 1) == [25]
+
+
+def test_a_repeated_picture_is_seen_and_a_small_motion_is_not_one() -> None:
+    grey = np.random.default_rng(0).integers(0, 255, (36, 64), dtype=np.uint8)
+    moved = grey.copy()
+    moved[10:12, 10:12] ^= 8
+    assert difference(grey, grey)[1] and not difference(moved, grey)[1]
+
+
+def test_usable_time_bridges_repeated_frames_but_not_cuts() -> None:
+    time = np.arange(100) / 50
+    every_other = np.arange(100) % 2 == 0
+    assert usable_seconds(frames_of(time, every_other)) == pytest.approx(2.0, abs=0.05)
+    lost = (time < 0.5) | (time >= 1.5)
+    assert usable_seconds(frames_of(time, lost)) == pytest.approx(1.0, abs=0.03)
+    assert usable_seconds(frames_of(time, np.zeros(100, bool))) == 0
+
+
+def test_split_is_two_to_one_to_one_in_time_and_disjoint() -> None:
+    time = np.arange(3000) / 25
+    usable = (time < 20) | (time > 40)  # 100 s
+    split = make_split(frames_of(time, usable))
+    seconds = {k: sum(b - a for a, b in split[k]) for k in ("train", "val", "test")}
+    assert split["usable_seconds"] == pytest.approx(100, abs=0.2)
+    assert seconds == pytest.approx({"train": 50, "val": 25, "test": 25}, abs=0.5)
+    assert split["train"][0] == [0.0, pytest.approx(20, abs=0.05)]
+    assert split["val"][0][0] - split["train"][-1][1] >= 0.15
+    assert split["test"][0][0] - split["val"][-1][1] >= 0.15
+
+
+def test_split_moves_to_a_cut_nearby() -> None:
+    time = np.arange(1000) / 25
+    segment = (time >= 20.8).astype(int)
+    split = make_split(frames_of(time, np.ones(1000, bool), segment))
+    assert split["train"][-1][1] == pytest.approx(20.8, abs=0.05)
+    assert split["val"][0][0] == pytest.approx(20.8, abs=0.05)
+
+
+def tracklet(person: int, frames: range, width: float = 50, seed: int = 0) -> Tracklet:
+    """A face whose shape and portrait are those of `person`, with some noise and in another pose."""
+    own, noise = np.random.default_rng(person), np.random.default_rng(seed + 1000)
+    shape = np.random.default_rng(99).normal(size=(478, 3)) + 0.15 * own.normal(size=(478, 3))
+    portrait = own.integers(0, 255, (14, 12))
+    t = Tracklet(0, list(frames), [f / 25 for f in frames])
+    t.boxes = [np.array([0, 0, width, width], np.float32)] * len(t.frames)
+    t.shapes = [(100 * (shape + 0.01 * noise.normal(size=shape.shape)) + 7).astype(np.float32)] * 2
+    t.portraits = [(0.7 * portrait + noise.integers(0, 20, portrait.shape)).astype(np.uint8)] * 2
+    return t
+
+
+def test_the_person_most_in_the_picture_is_kept_over_cuts() -> None:
+    mine = [tracklet(1, range(0, 50)), tracklet(1, range(100, 160), seed=1)]
+    other = [tracklet(2, range(50, 100))]
+    kept, left = main_person([*other, *mine])
+    assert {id(t) for t in kept} == {id(t) for t in mine} and left == other
+
+
+def test_one_of_two_people_seen_together_is_kept() -> None:
+    together = [tracklet(1, range(0, 50)), tracklet(2, range(0, 50), width=80)]
+    kept, left = main_person(together)
+    assert kept == [together[1]] and left == [together[0]]
+
+
+def test_what_the_landmarker_never_took_for_a_face_is_nobody() -> None:
+    ghost = tracklet(1, range(0, 50))
+    ghost.shapes, ghost.portraits = [], []
+    assert main_person([ghost]) == ([], [])
+
+
+def test_no_sound_silence_and_no_face_are_named(tmp_path: Path) -> None:
+    pictures, times = moving(30), [i / 25 for i in range(30)]
+    mute = write_video(tmp_path / "mute.mkv", pictures, times)
+    silent = write_video(tmp_path / "silent.mkv", pictures, times, np.zeros(RATE, np.float32))
+    nobody = write_video(tmp_path / "nobody.mkv", pictures, times, clicks([0.2], 1.0))
+    for path, words in ((mute, "no sound"), (silent, "silent"), (nobody, "no face")):
+        with pytest.raises(UserError, match=words) as caught:
+            ingest_video(path)
+        assert "\n" not in str(caught.value)
+
+
+SHARED = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[3] / "shared")) / "data/videos"
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs the shared videos")
+def test_a_real_face_is_used_up_to_the_cartoon() -> None:
+    frames, _ = find_usable(probe(SHARED / "face_then_cartoon_6s.mov"))
+    assert frames.usable[frames.time < 2.3].mean() > 0.95
+    assert not frames.usable[frames.time > 2.5].any()
+    with pytest.raises(UserError, match=rf"only 2\.\d s of usable face, at least {MIN_USABLE_S:.0f} s"):
+        ingest_video(SHARED / "face_then_cartoon_6s.mov")
