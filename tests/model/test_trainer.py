@@ -92,7 +92,7 @@ def test_a_state_of_another_training_is_refused(tmp_path: Path) -> None:
     checkpoint, sequences = start()
     Trainer(checkpoint, sequences, tmp_path, TINY).train()
     with pytest.raises(ModelError, match="other settings or data"):
-        Trainer(checkpoint, sequences, tmp_path, replace(TINY, learning_rate=1e-3))
+        Trainer(checkpoint, sequences, tmp_path, replace(TINY, learning_rate=3e-4))
     with pytest.raises(ModelError, match="other settings or data"):
         Trainer(checkpoint, sequences[:1], tmp_path, TINY)
     Trainer(checkpoint, sequences, tmp_path, replace(TINY, threads=2, log_every=7))  # changes no result
