@@ -48,7 +48,7 @@ class TrainingConfig:
     """Checkpoints kept on the way, evenly spaced, for the choice on validation."""
     seed: int = 0
     threads: int = 1
-    """For torch, while training (ours). Two wait for each other on a busy machine of two cores, at 100 times the cost."""
+    """For torch, while training (ours). Two wait for each other on a busy machine of two cores."""
     save_seconds: float = 20.0
     """A killed run loses at most this much (ours)."""
     log_every: int = 50
