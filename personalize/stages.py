@@ -91,6 +91,7 @@ class CameraStage(Stage):
             focal_given=context.settings.focal_px,
             usable=frames.usable,
             segments=frames.segment,
+            progress=context.report.progress,
         )
         files.write_camera(folder, camera, bundle)
 

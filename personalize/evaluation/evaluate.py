@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.checkpoint import Checkpoint
-from model.metrics import score
+from model.metrics import lip_opening_mm, score
 from model.ridge import Ridge
 from model.speech import load_encoder
 from model.synthesis import synthesize
@@ -117,17 +117,6 @@ def _write_samples(
     (folder / "samples").mkdir()
     write_npz(folder / "samples/test.npz", time=time, reference=reference, samples=samples[:, :length])
     write_clip(run, folder / "samples/test.mp4", data.motion, subject, time, reference, samples[0, :length])
-    gaps = lip_opening_mm(
-        subject, data.motion.template, np.concatenate([reference[None], samples[:, :length]])
-    )
+    both = np.concatenate([reference[None], samples[:, :length]])
+    gaps = lip_opening_mm(data.motion.template, subject.basis, subject.regions, both)
     return Evaluation(metrics, time, gaps[0], gaps[1:])
-
-
-def lip_opening_mm(checkpoint: Checkpoint, template: F32, coefficients: F32) -> F32:
-    """Distance of the middles of the inner lips, mm: coefficients [..., K] -> [...]."""
-    ends = []
-    for name in ("inner_lip_upper", "inner_lip_lower"):
-        loop = checkpoint.regions[name]
-        middle = loop[len(loop) // 2]
-        ends.append(template[middle] + np.tensordot(coefficients, checkpoint.basis[:, middle], axes=1))
-    return (np.linalg.norm(ends[0] - ends[1], axis=-1) * 1000).astype(np.float32)
