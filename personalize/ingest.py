@@ -15,6 +15,7 @@ from personalize.errors import UserError
 from personalize.media import MediaInfo, on_video_clock, probe, read_audio, read_frames
 from personalize.people import FaceFollower, Tracklet, main_person
 from personalize.shots import (
+    MAX_GAP_S,
     MIN_SHOT_S,
     REASONS,
     THUMBNAIL,
@@ -120,7 +121,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     for name, marked in marks.items():  # the last that applies stays
         reason[marked] = REASONS.index(name)
     frames = Frames(time, reason == 0, reason, REASONS, segment, box.astype(np.float32))
-    return frames, _warnings(frames, eyes, light)
+    return frames, _lost_in_file(media, time) + _warnings(frames, eyes, light)
 
 
 def _look_for_cuts(
@@ -175,6 +176,18 @@ def _cut(time: NDArray[np.float64], segment: NDArray[np.int32]) -> NDArray[np.bo
     return first | (length[segment] < MIN_SHOT_S)
 
 
+def _lost_in_file(media: MediaInfo, time: NDArray[np.float64]) -> list[str]:
+    """What the file holds no pictures of: gaps, and an end that comes early."""
+    texts = []
+    gaps = np.flatnonzero(np.diff(time) > MAX_GAP_S)
+    if len(gaps):
+        seconds, first = float(np.diff(time)[gaps].sum()), float(time[gaps[0]])
+        texts.append(f"{seconds:.1f} s without pictures in {len(gaps)} gaps, the first at {first:.1f} s")
+    if media.duration_s - time[-1] > 1.0:
+        texts.append(f"the file breaks off at {time[-1]:.1f} s of {media.duration_s:.1f} s")
+    return texts
+
+
 def _warnings(frames: Frames, eyes: NDArray[np.float32], light: NDArray[np.float32]) -> list[str]:
     """What the person should know of a clip that is used all the same."""
     texts = []
@@ -200,7 +213,7 @@ def _too_little(media: MediaInfo, frames: Frames, seconds: float) -> str:
     if not frames.usable.any() and counts[0] == counts.sum():
         return f"{media.path}: no face was found in it; give a video of a talking face"
     text = f"{media.path}: only {seconds:.1f} s of usable face, at least {MIN_USABLE_S:.0f} s are needed"
-    if counts.any():
+    if counts.max() > 0.05 * len(frames.time):
         name = REASONS[1 + int(counts.argmax())]
         text += f"; in {counts.max() / len(frames.time):.0%} of the frames {DESCRIPTIONS[name]}"
     return text + "; give a longer or better video"

@@ -121,6 +121,12 @@ def test_no_sound_silence_and_no_face_are_named(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
+def test_what_the_file_lost_is_said(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "gap.mkv", moving(20), [i / 25 + (i >= 10) for i in range(20)])
+    _, warnings = find_usable(probe(path))
+    assert any("1.0 s without pictures in 1 gaps, the first at 0.4 s" in text for text in warnings)
+
+
 SHARED = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[3] / "shared")) / "data/videos"
 
 
