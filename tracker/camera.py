@@ -64,7 +64,9 @@ def estimate_camera(
     if focal_given is None and _tells_depth(scene, start):
         sd_log = _focal_sd_log(scene, focal, formal, prior)
         camera = _joined(prior, focal, float(np.hypot(sd_log, _start_dependence(start, prior, focal))))
-    return camera, _bundle(_final(scene, start, focal, camera))
+    # Windows that fall back on their first poses must fit the final focal length, not the prior's.
+    first = _scaled(start, camera.focal_px / prior.focal_px)
+    return camera, _bundle(_final(scene, first, focal, camera))
 
 
 def _adjust(scene: RigidScene, camera: Camera, refine_focal: bool) -> tuple[RigidScene, float, float] | None:

@@ -1,0 +1,232 @@
+"""Camera, end to end on a filmed head: from pixels to focal length, and clips that give nothing."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial.transform import Rotation
+
+from tracker.bundle_adjustment import RigidScene, absolute_pose, adjust, camera_model
+from tracker.camera import PRIOR_FOCAL, PRIOR_SD_LOG, estimate_camera
+from tracker.feature_tracks import track_features
+from tracker.head import load_head
+from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
+from tracker.raster import project, rasterize
+from tracker.track import Camera, Landmarks
+
+HEAD = load_head()
+SIZE, FOCAL, DISTANCE = (480, 480), 880.0, 0.55  # 1.83 x the long side: far from the prior
+PRINCIPAL = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+FPS, COUNT = 8.0, 40
+TURN = (8.0, 20.0, 4.0)  # degrees
+Clip = tuple[Landmarks, list[tuple[float, NDArray[np.uint8]]], NDArray[np.float64]]
+
+
+def poses(degrees: tuple[float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation [T, 3, 3] and translation [T, 3] m of a head that turns by so much about x, y and z."""
+    t = np.arange(COUNT) / FPS
+    turn = Rotation.from_rotvec(
+        np.radians(degrees) * np.sin(np.outer(t, [1.7, 1.3, 0.9]) + np.array([0.5, 0, 1]))
+    )
+    rotation = turn.as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    return rotation, np.array([0, 0, DISTANCE]) - rotation @ HEAD.template.mean(0)
+
+
+def film(degrees: tuple[float, float, float], noise: float = 2.0) -> Clip:
+    """The mean head in a mottled skin, and its landmarks with noise of half a pixel; rotations are the truth."""
+    rng = np.random.default_rng(1)
+    rotation, translation = poses(degrees)
+    skin = gaussian_filter(rng.standard_normal((96, 96, 96)), 1.0)
+    skin = 130 + 30 * skin / skin.std()
+    low, extent = HEAD.template.min(0), float(np.ptp(HEAD.template, axis=0).max())
+    rest = np.zeros(len(HEAD.identity_basis), np.float32), np.zeros(len(HEAD.expression_names), np.float32)
+    surface = HEAD.landmark_positions(*rest)
+    points = np.zeros((COUNT, POINTS, 3), np.float32)
+    pictures = []
+    for frame in range(COUNT):
+        seen = HEAD.template @ rotation[frame].T + translation[frame]
+        pixels = np.column_stack([project(seen, FOCAL, PRINCIPAL), seen[:, 2]])
+        raster = rasterize(pixels, HEAD.faces, SIZE)
+        hit = raster.triangle >= 0
+        corners = HEAD.template[HEAD.faces[raster.triangle[hit]]]
+        place = np.einsum("nc,nci->ni", raster.barycentric[hit], corners)
+        gray = np.full(SIZE[::-1], 60.0)
+        gray[hit] = map_coordinates(skin, 95 * (place - low).T / extent, order=1)
+        gray = cv2.GaussianBlur(gray, (0, 0), 0.7) + noise * rng.standard_normal(gray.shape)
+        pictures.append((frame / FPS, np.repeat(gray.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)))
+        marks = project(surface @ rotation[frame].T + translation[frame], FOCAL, PRINCIPAL)
+        marks += 0.5 * rng.standard_normal(marks.shape)
+        points[frame, HEAD.landmark_embedding.landmarks, :2] = marks
+    return landmarks_of(points), pictures, rotation
+
+
+def landmarks_of(points: NDArray[np.float32]) -> Landmarks:
+    count = len(points)
+    presence = np.isfinite(points[:, 0, 0]).astype(np.float32)
+    scores = np.zeros((count, len(BLENDSHAPE_NAMES)), np.float32)
+    return Landmarks(np.arange(count) / FPS, points, presence, scores, BLENDSHAPE_NAMES, SIZE)
+
+
+def again(pictures: list) -> Callable[[], Iterable]:
+    return lambda: iter(pictures)
+
+
+def assert_prior(camera: Camera) -> None:
+    assert camera.method == "prior"
+    assert camera.focal_px == pytest.approx(PRIOR_FOCAL * max(SIZE))
+    assert camera.focal_sd_log == PRIOR_SD_LOG
+
+
+@pytest.fixture(scope="module")
+def turning() -> Clip:
+    return film(TURN)
+
+
+@pytest.fixture(scope="module")
+def found(turning):
+    return estimate_camera(turning[0], again(turning[1]), HEAD)
+
+
+def test_a_turning_head_tells_the_focal_length(found):
+    camera, _ = found
+    assert camera.method == "bundle"
+    assert camera.focal_px == pytest.approx(FOCAL, rel=0.12)
+    assert abs(np.log(camera.focal_px / FOCAL)) < 3 * camera.focal_sd_log
+    assert 0 < camera.focal_sd_log < PRIOR_SD_LOG
+    assert camera.principal_px == PRINCIPAL and camera.size == SIZE and camera.distortion == ()
+    assert str(PRIOR_FOCAL) in camera.prior
+
+
+def test_points_lie_on_the_head_and_project_to_what_was_seen(found):
+    camera, bundle = found
+    rows = np.searchsorted(bundle.frame, bundle.observations[:, 0].astype(int))
+    turn = Rotation.from_rotvec(bundle.rotation).as_matrix()[rows]
+    point = bundle.points[bundle.observations[:, 1].astype(int)]
+    seen = np.einsum("oij,oj->oi", turn, point) + bundle.translation[rows]
+    error = project(seen, camera.focal_px, camera.principal_px) - bundle.observations[:, 2:]
+    assert np.median(np.linalg.norm(error, axis=1)) < 0.7
+    distance = np.linalg.norm(bundle.points[:, None] - HEAD.template[None, HEAD.regions["face"]], axis=-1)
+    assert np.median(distance.min(1)) < 0.005
+
+
+def test_the_same_clip_gives_the_same_camera(turning, found):
+    camera, bundle = estimate_camera(turning[0], again(turning[1]), HEAD)
+    assert camera == found[0]
+    for name in ("frame", "rotation", "translation", "points", "observations"):
+        assert np.array_equal(getattr(bundle, name), getattr(found[1], name)), name
+
+
+def test_a_still_head_leaves_the_prior():
+    landmarks, pictures, _ = film((0.5, 1.0, 0.3))
+    camera, bundle = estimate_camera(landmarks, again(pictures), HEAD)
+    assert_prior(camera)
+    assert np.isfinite(bundle.translation).all() and (bundle.translation[:, 2] > 0).all()
+
+
+def test_a_picture_without_corners_leaves_the_prior(turning):
+    blank = [(time, np.full_like(rgb, 128)) for time, rgb in turning[1]]
+    camera, bundle = estimate_camera(turning[0], again(blank), HEAD)
+    assert_prior(camera)
+    assert len(bundle.points) == len(bundle.observations) == 0
+
+
+def test_no_face_or_no_usable_frame_leaves_the_prior(turning):
+    gone = landmarks_of(np.full_like(turning[0].points, np.nan))
+    nothing = np.zeros(COUNT, bool)
+    for landmarks, usable in ((gone, None), (turning[0], nothing)):
+        camera, bundle = estimate_camera(landmarks, again(turning[1]), HEAD, usable=usable)
+        assert_prior(camera)
+        assert bundle.rotation.shape == bundle.translation.shape == bundle.points.shape == (0, 3)
+        assert bundle.observations.shape == (0, 4)
+
+
+def test_frames_without_a_face_have_no_pose(turning):
+    points = turning[0].points.copy()
+    points[10:14] = np.nan
+    camera, bundle = estimate_camera(landmarks_of(points), again(turning[1]), HEAD)
+    assert not np.isin(np.arange(10, 14), bundle.frame).any() and len(bundle.frame)
+    assert np.isfinite(camera.focal_px)
+
+
+def test_tracks_stay_on_the_skin(turning):
+    landmarks, pictures, rotation = turning
+    _, translation = poses(TURN)
+    tracks = track_features(pictures, landmarks, np.ones(COUNT, bool), np.zeros(COUNT, np.int32))
+    rows = tracks.observations
+    begun = rows[rows[:, 0] == 0]
+    assert len(begun) > 50 and np.bincount(rows[:, 1].astype(int)).min() >= 5
+    seen = HEAD.template @ rotation[0].T + translation[0]
+    raster = rasterize(np.column_stack([project(seen, FOCAL, PRINCIPAL), seen[:, 2]]), HEAD.faces, SIZE)
+    x, y = begun[:, 2:].round().astype(int).T
+    assert (raster.triangle[y, x] >= 0).all()
+    skin = np.einsum("nc,nci->ni", raster.barycentric[y, x], HEAD.template[HEAD.faces[raster.triangle[y, x]]])
+    place = dict(zip(begun[:, 1].astype(int).tolist(), skin))
+    later = rows[(rows[:, 0] >= 5) & np.isin(rows[:, 1], begun[:, 1])]
+    points = np.stack([place[int(track)] for track in later[:, 1]])
+    frame = later[:, 0].astype(int)
+    there = np.einsum("oij,oj->oi", rotation[frame], points) + translation[frame]
+    error = np.linalg.norm(project(there, FOCAL, PRINCIPAL) - later[:, 2:], axis=1)
+    assert np.median(error) < 1  # half of it from rounding the first place to a pixel
+
+
+def scene(noise_px: float, seed: int = 0) -> RigidScene:
+    """150 points of the head's front, all seen in all frames, with noise."""
+    rng = np.random.default_rng(seed)
+    rotation, translation = poses(TURN)
+    points = HEAD.template[rng.choice(HEAD.regions["face"], 150, replace=False)].astype(np.float64)
+    seen = np.einsum("mij,qj->mqi", rotation, points) + translation[:, None]
+    xy = project(seen, FOCAL, PRINCIPAL) + noise_px * rng.standard_normal((COUNT, len(points), 2))
+    frame, point = np.mgrid[:COUNT, : len(points)].reshape(2, -1)
+    return RigidScene(
+        frames=np.arange(COUNT, dtype=np.int32),
+        rotation=rotation,
+        translation=translation,
+        points=points,
+        observations=np.column_stack([frame, point, xy.reshape(-1, 2)]),
+        window=np.zeros(COUNT, np.int32),
+    )
+
+
+def test_bundle_adjustment_finds_the_focal_length_and_knows_how_well():
+    true, model = scene(0.3), camera_model(PRIOR_FOCAL * max(SIZE), PRINCIPAL, SIZE)
+    factor = PRIOR_FOCAL * max(SIZE) / FOCAL
+    rng = np.random.default_rng(4)
+    start = replace(
+        true,
+        translation=true.translation * (1, 1, factor),
+        points=true.points + 0.003 * rng.standard_normal(true.points.shape),
+    )
+    adjusted, focal, formal = adjust(start, model, refine_focal=True)
+    assert focal == pytest.approx(FOCAL, rel=0.03)
+    assert abs(np.log(focal / FOCAL)) < 5 * 0.3 * formal
+    assert np.std(adjusted.residuals(focal, PRINCIPAL)) < 0.32
+
+
+def test_fixed_points_and_a_known_focal_length_stay():
+    true = scene(0.3)
+    fixed = np.arange(len(true.points)) < 100
+    adjusted, focal, formal = adjust(true, camera_model(FOCAL, PRINCIPAL, SIZE), False, fixed)
+    assert (focal, formal) == (FOCAL, 0.0)
+    assert np.array_equal(adjusted.points[fixed], true.points[fixed])
+    assert not np.array_equal(adjusted.points[~fixed], true.points[~fixed])
+
+
+def test_absolute_pose_is_exact_with_outliers_and_pixel_centres_at_integers():
+    true = scene(0.0)
+    xy = true.observations[:150, 2:].copy()
+    xy[:20] += 40
+    rotation, translation = absolute_pose(xy, true.points, camera_model(FOCAL, PRINCIPAL, SIZE), 3.0)
+    assert np.allclose(rotation, true.rotation[0], atol=1e-4)
+    assert np.allclose(translation, true.translation[0], atol=1e-4)
+
+
+def test_a_failed_adjustment_leaves_the_prior(turning, monkeypatch):
+    monkeypatch.setattr(pycolmap, "estimate_ba_covariance", lambda *_: None)
+    camera, bundle = estimate_camera(turning[0], again(turning[1]), HEAD)
+    assert_prior(camera)
+    assert len(bundle.frame) and np.isfinite(bundle.translation).all()
