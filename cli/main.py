@@ -11,6 +11,8 @@ from typing import Annotated
 # Threads are set on purpose, per stage: left alone, OpenMP and BLAS both take every core and wait for each other.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Training takes two threads. They must sleep while they wait: spinning costs 100 times the time on a busy machine.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import typer
 

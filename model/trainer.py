@@ -47,8 +47,8 @@ class TrainingConfig:
     candidates: int = 10
     """Checkpoints kept on the way, evenly spaced, for the choice on validation."""
     seed: int = 0
-    threads: int = 1
-    """For torch, while training (ours). Two wait for each other on a busy machine of two cores."""
+    threads: int = 2
+    """For torch, while training (ours)."""
     save_seconds: float = 20.0
     """A killed run loses at most this much (ours)."""
     log_every: int = 50
