@@ -25,6 +25,7 @@ from personalize.shots import (
     usable_seconds,
 )
 from personalize.split import make_split
+from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.landmarker import FaceLandmarker
 
 Progress = Callable[[int, int], None] | None
@@ -36,6 +37,7 @@ MIN_EYES_PX = 20.0  # between the eyes; below, lip motion is lost in the landmar
 GOOD_EYES_PX = 45.0
 MIN_LIGHT, GOOD_LIGHT = 15.0, 35.0  # mean grey level of the face
 MIN_SHARPNESS = 0.2  # see people.sharpness: blocky or noisy video has 0.3 to 0.6
+MAX_TILT_DEG = 60.0  # of the line of the eyes: people tilt their heads by up to 45
 SILENCE = 1e-3  # peak of the sound, -60 dB
 MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it for no longer
 
@@ -65,7 +67,8 @@ class Ingested:
 def ingest_video(path: Path | str, progress: Progress = None) -> Ingested:
     """Look through a video: times, usable frames, sound, split.
 
-    Raises UserError when the file is no video, has no sound or silence only, or under 10 s of one usable face.
+    Raises UserError when the file is no video, has no sound or silence only, lies on its side, or has
+    under 10 s of one usable face.
     """
     media = probe(path)
     audio = _read_sound(media)
@@ -97,6 +100,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     time, change, same, corrupt = _look_for_cuts(media, progress)
     segment = find_shots(time, change)
     mine, others = main_person(_follow_faces(media, segment, progress))
+    _check_upright(media, mine)
     total = len(time)
     reason = np.full(total, REASONS.index("no_face"), np.uint8)
     for tracklet in others:
@@ -122,6 +126,17 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
         reason[marked] = REASONS.index(name)
     frames = Frames(time, reason == 0, reason, REASONS, segment, box.astype(np.float32))
     return frames, _lost_in_file(media, time) + _warnings(frames, eyes, light)
+
+
+def _check_upright(media: MediaInfo, person: list[Tracklet]) -> None:
+    """Raise UserError when the person lies on their side or head for most of the clip: the head is fitted upright."""
+    across = [shape[LEFT_EYE_OUTER, :2] - shape[RIGHT_EYE_OUTER, :2] for t in person for shape in t.shapes]
+    if across:
+        tilt = np.degrees(np.arctan2(*np.transpose(across)[::-1]))
+        if float(np.median(np.abs(tilt))) > MAX_TILT_DEG:
+            raise UserError(
+                f"{media.path}: the picture lies on its side, no upright face is in it; turn the video"
+            )
 
 
 def _look_for_cuts(
