@@ -15,6 +15,7 @@ from personalize.people import Tracklet, main_person
 from personalize.shots import REASONS, Frames, difference, find_shots, usable_seconds
 from personalize.split import make_split
 from tests.personalize.video_factory import RATE, clicks, moving, write_video
+from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 
 
 def frames_of(time: np.ndarray, usable: np.ndarray, segment: np.ndarray | None = None) -> Frames:
@@ -119,6 +120,26 @@ def test_no_sound_silence_and_no_face_are_named(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=words) as caught:
             ingest_video(path)
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("tilt_deg", "refused"), [(-90, True), (90, True), (180, True), (0, False), (40, False)]
+)
+def test_a_face_that_lies_on_its_side_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tilt_deg: float, refused: bool
+) -> None:
+    path = write_video(tmp_path / "clip.mkv", moving(20), [i / 25 for i in range(20)])
+    face = tracklet(1, range(20))
+    face.eyes, face.light, face.sharpness = [60.0] * 20, [120.0] * 20, [0.5] * 20
+    angle = np.radians(tilt_deg)
+    for shape in face.shapes:
+        shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + 60 * np.array([np.cos(angle), np.sin(angle)])
+    monkeypatch.setattr("personalize.ingest._follow_faces", lambda *_: [face])
+    if refused:
+        with pytest.raises(UserError, match="on its side"):
+            find_usable(probe(path))
+    else:
+        assert find_usable(probe(path))[0].usable.any()
 
 
 def test_what_the_file_lost_is_said(tmp_path: Path) -> None:
