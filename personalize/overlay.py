@@ -19,6 +19,7 @@ from tracker.overlay import contact_sheet, draw_overlay, panel_size
 
 PREVIEW_WIDTH, PREVIEW_CRF, PREVIEW_S = 720, 30, 60.0
 WORST, SPREAD = 8, 8
+TILE, FACE_MARGIN = 480, 1.5  # px; of the face's own extent
 AUDIO_RATE = 48_000
 
 U8 = NDArray[np.uint8]
@@ -47,7 +48,8 @@ def write_overlay(run: RunFolder, folder: Path, progress: Callable[[int, int], N
             if time < PREVIEW_S:
                 preview.write(cv2.resize(picture, small, interpolation=cv2.INTER_AREA), time)
             if frame in shown:
-                kept[frame] = picture[:, picture.shape[1] // 2 :]
+                scale = height / rgb.shape[0]
+                kept[frame] = _around_face(picture[:, width:], landmarks.points[frame, :, :2] * scale)
             progress(frame + 1, total)
     sheet = contact_sheet([kept[frame] for frame in notable_frames(track.valid, track.confidence)])
     _, png = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
@@ -66,3 +68,14 @@ def notable_frames(valid: NDArray[np.bool_], confidence: NDArray[np.float32]) ->
             break
     spread = tracked[np.linspace(0, len(tracked) - 1, SPREAD).round().astype(int)]
     return np.concatenate([np.asarray(worst, np.intp), spread])
+
+
+def _around_face(picture: U8, points: NDArray[np.float32]) -> U8:
+    """A square of the picture around the points [478, 2] px, TILE px a side: on it a wrong mesh can be seen."""
+    low, high = points.min(0), points.max(0)
+    side = float((high - low).max()) * FACE_MARGIN
+    scale = TILE / side
+    window = np.array([[scale, 0, 0], [0, scale, 0]])
+    window[:, 2] = (TILE - 1) / 2 - scale * (low + high) / 2
+    tile: U8 = cv2.warpAffine(picture, window, (TILE, TILE), flags=cv2.INTER_AREA)
+    return tile

@@ -66,6 +66,7 @@ class LandmarkStage(Stage):
             read_frames(context.run.video),
             len(frames.time),
             cuts=set(np.flatnonzero(np.diff(frames.segment)) + 1),
+            boxes=frames.box,
             progress=context.report.progress,
         )
         files.write_landmarks(folder / "landmarks.npz", landmarks)

@@ -176,7 +176,7 @@ class _Network:
 
 
 class LandmarkTracker:
-    """Follows the largest face: the landmarks of one frame give the region of the next."""
+    """Follows one face, the largest unless told where: the landmarks of one frame give the region of the next."""
 
     def __init__(self, landmarker: FaceLandmarker) -> None:
         self._landmarker = landmarker
@@ -188,19 +188,30 @@ class LandmarkTracker:
         self._roi = None
         self._frames_without = 0
 
-    def next(self, rgb: NDArray[np.uint8]) -> tuple[F32, float, F32] | None:
-        """Landmarks, presence and blendshapes (as `FaceLandmarker.landmarks`) of the next frame, or None."""
+    def next(self, rgb: NDArray[np.uint8], box: F32 | None = None) -> tuple[F32, float, F32] | None:
+        """Landmarks, presence and blendshapes (as `FaceLandmarker.landmarks`) of the next frame, or None.
+
+        box: [4] left, top, right, bottom px of the face that is meant, where it is known.
+        """
+        if (
+            self._roi is not None
+            and box is not None
+            and not _inside(np.array([self._roi.x, self._roi.y]), box)
+        ):
+            self.reset()
         if self._roi is not None:
             found = self._landmarker.landmarks(rgb, self._roi)
             if found[1] >= MIN_PRESENCE:
                 self._roi = self._roi.blend(roi_from_points(found[0]), SMOOTHING)
                 return found
-        return self._search(rgb)
+        return self._search(rgb, box)
 
-    def _search(self, rgb: NDArray[np.uint8]) -> tuple[F32, float, F32] | None:
+    def _search(self, rgb: NDArray[np.uint8], box: F32 | None) -> tuple[F32, float, F32] | None:
         self._roi = None
         faces = self._landmarker.detect(rgb, tiled=self._frames_without % SEARCH_INTERVAL == 0)
         self._frames_without += 1
+        if box is not None:
+            faces = [face for face in faces if _inside((face.box[:2] + face.box[2:]) / 2, box)]
         for face in sorted(faces, key=lambda f: f.box[0] - f.box[2]):
             points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
             if presence < MIN_PRESENCE:
@@ -214,16 +225,23 @@ class LandmarkTracker:
         return None
 
 
+def _inside(point: NDArray[np.floating], box: F32) -> bool:
+    """Whether a point [2] lies in a box [4] left, top, right, bottom."""
+    return bool((point >= box[:2]).all() and (point <= box[2:]).all())
+
+
 def track_landmarks(
     frames: Iterable[tuple[float, NDArray[np.uint8]]],
     total: int,
     cuts: set[int] | None = None,
+    boxes: F32 | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Landmarks:
     """Landmarks of a whole clip.
 
     frames: (time s, rgb [H, W, 3] u8) in order, all of one size, at least one. total: how many, for progress.
     cuts: indices of frames that begin another shot, where nothing is taken over from the frame before.
+    boxes: [T, 4] px, left, top, right, bottom of the face that is meant, NaN where it is not known.
     """
     tracker = LandmarkTracker(FaceLandmarker())
     times: list[float] = []
@@ -234,7 +252,8 @@ def track_landmarks(
         if cuts is not None and index in cuts:
             tracker.reset()
         times.append(time)
-        rows.append(tracker.next(rgb) or nothing)
+        box = None if boxes is None or np.isnan(boxes[index]).any() else boxes[index]
+        rows.append(tracker.next(rgb, box) or nothing)
         size = (rgb.shape[1], rgb.shape[0])
         if progress is not None:
             progress(index + 1, total)
