@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.motion import topology_hash
+from personalize.talkers.skin import painted, seen_faces
 from tracker.head import load_head
 from tracker.raster import render
 
@@ -28,8 +29,8 @@ class FaceCamera:
     def __init__(
         self, template: F32, faces: NDArray[np.int32], face: NDArray[np.integer], size: tuple[int, int]
     ) -> None:
-        self.template, self.faces, self.size = template, faces, size
-        self._albedo = appearance(template, faces)
+        self.template, self.size = template, size
+        self.faces, self._albedo = appearance(template, faces)
         low, high = template[face].min(0), template[face].max(0)
         self._focal = FOCAL_IN_HEIGHTS * size[1]
         distance = float(high[1] - low[1]) * self._focal / (FACE_SHARE_OF_HEIGHT * size[1])
@@ -48,9 +49,13 @@ class FaceCamera:
         return render(vertices, self.faces, self._albedo, self._focal, principal, self.size)
 
 
-def appearance(template: F32, faces: NDArray[np.int32]) -> U8:
-    """[D, 3] u8 RGB: the embedded head's painted skin on its own topology, plain clay on any other."""
+def appearance(template: F32, faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], U8]:
+    """Triangles to show [F', 3] and vertex colours [D, 3] u8 RGB.
+
+    On the embedded head's own topology the painted skin, without the tongue, which would fill the mouth; plain clay
+    on any other.
+    """
     head = load_head()
     if topology_hash(len(template), faces) == topology_hash(len(head.template), head.faces):
-        return head.albedo
-    return np.tile(np.asarray(CLAY, np.uint8), (len(template), 1))
+        return seen_faces(head), painted(head)
+    return faces, np.tile(np.asarray(CLAY, np.uint8), (len(template), 1))
