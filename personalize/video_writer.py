@@ -15,6 +15,8 @@ from personalize.sound import AUDIO_RATE
 
 _TIME_BASE = Fraction(1, 90_000)
 _BT709 = 1
+# Without B pictures: with them this encoder's bytes differ from run to run, and a remade file would not be the same.
+_X264 = {"preset": "veryfast", "bf": "0"}
 
 
 class VideoWriter:
@@ -43,9 +45,7 @@ class VideoWriter:
         self._count = 0
         self._container = av.open(str(self._partial), "w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(fps).limit_denominator(1001)
-        self._video = self._container.add_stream(
-            "libx264", rate=rate, options={"crf": str(crf), "preset": "veryfast"}
-        )
+        self._video = self._container.add_stream("libx264", rate=rate, options=_X264 | {"crf": str(crf)})
         self._video.width, self._video.height = size[0] + size[0] % 2, size[1] + size[1] % 2
         self._video.pix_fmt = "yuv420p"
         self._video.codec_context.time_base = _TIME_BASE
