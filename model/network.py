@@ -60,7 +60,10 @@ def reflect(x: Tensor) -> Tensor:
 
 
 class TimeConv(nn.Module):
-    """Convolution of three taps over time, reflect padding: [N, *b, in] -> [N, *b, out]."""
+    """Convolution over time of three taps, reflect padding: [N, *b, in] -> [N, *b, out].
+
+    The frames of a window stand side by side, so that a convolution is one large matrix product.
+    """
 
     def __init__(self, inputs: int, outputs: int, bias: bool = True, taps: int = 3) -> None:
         super().__init__()
@@ -70,11 +73,12 @@ class TimeConv(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """See the class."""
-        length, padded = len(x), reflect(x)
-        y = padded[:length] @ self.weight[0]
-        y = y + padded[1 : length + 1] @ self.weight[1]
-        y = y + padded[2:] @ self.weight[2]
-        return y if self.bias is None else y + self.bias
+        before, after = torch.cat([x[1:2], x[:-1]]), torch.cat([x[1:], x[-2:-1]])
+        return self._product([before, x, after], self.weight)
+
+    def _product(self, frames: list[Tensor], weight: Tensor) -> Tensor:
+        """Frames side by side, [.., in] each, times the taps of weight [taps, in, out]."""
+        return F.linear(torch.cat(frames, dim=-1), weight.flatten(0, 1).T, self.bias)
 
 
 class Down(TimeConv):
@@ -85,8 +89,8 @@ class Down(TimeConv):
 
     def forward(self, x: Tensor) -> Tensor:
         """See the class."""
-        assert len(x) % 2 == 0 and self.bias is not None
-        return x[0::2] @ self.weight[0] + x[1::2] @ self.weight[1] + self.bias
+        assert len(x) % 2 == 0
+        return self._product([x[0::2], x[1::2]], self.weight)
 
 
 class Up(TimeConv):
@@ -100,11 +104,10 @@ class Up(TimeConv):
 
     def forward(self, x: Tensor) -> Tensor:
         """See the class."""
-        assert self.bias is not None
-        length, padded = len(x), reflect(x)
-        even = padded[:length] @ self.weight[0] + x @ self.weight[1]
-        odd = x @ self.weight[2] + padded[2:] @ self.weight[3]
-        return torch.stack([even, odd], dim=1).flatten(0, 1) + self.bias
+        before, after = torch.cat([x[1:2], x[:-1]]), torch.cat([x[1:], x[-2:-1]])
+        even = self._product([before, x], self.weight[:2])
+        odd = self._product([x, after], self.weight[2:])
+        return torch.stack([even, odd], dim=1).flatten(0, 1)
 
 
 def sinusoidal(steps: Tensor, channels: int) -> Tensor:
