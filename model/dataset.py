@@ -95,6 +95,14 @@ class Batch:
     audio: Tensor
     style: Tensor
 
+    def part(self, rows: slice) -> Batch:
+        """Some of its crops."""
+        return Batch(self.motion[:, rows], self.audio[:, rows], self.style[rows])
+
+    def to(self, device: str) -> Batch:
+        """On a device."""
+        return Batch(self.motion.to(device), self.audio.to(device), self.style.to(device))
+
 
 class Crops:
     """All crops of `length` frames that lie inside runs of valid frames, equally likely."""

@@ -69,7 +69,8 @@ class Diffusion:
         """q(x_t | x0) = N(sqrt(abar_t) x0, (1 - abar_t) I), at the given unit noise; t [*b], x0 [N, *b,
         K].
         """
-        return self._signal[t][..., None] * x0 + self._noise[t][..., None] * noise
+        signal, level = self._levels(t)
+        return signal * x0 + level * noise
 
     def x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
         """The network's output [N, *b, K] as x0hat.
@@ -80,7 +81,12 @@ class Diffusion:
         """
         if self.parametrization == "plain":
             return output
-        return self._signal[t][..., None] * x_t + self._noise[t][..., None] * output
+        signal, level = self._levels(t)
+        return signal * x_t + level * output
+
+    def _levels(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """sqrt(abar_t) and sqrt(1 - abar_t) of steps t [*b], [*b, 1] each, on their device."""
+        return self._signal.to(t.device)[t][..., None], self._noise.to(t.device)[t][..., None]
 
     def times(self, steps: int | None, rule: Rule) -> list[int]:
         """The diffusion steps that a reverse chain visits, from noise to clean."""

@@ -1,8 +1,7 @@
-"""Training: METHOD's objective in the vertex metric, averaged weights, candidates, and exact continuation."""
+"""Training: METHOD's objective, averaged weights, candidates, exact continuation; on one process or several."""
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import time
@@ -11,16 +10,18 @@ from collections.abc import Sequence as Many
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, distributed, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from model.checkpoint import Checkpoint, State, read_tensors, serialize, write_atomically
 from model.dataset import Batch, Crops, Sequence
 from model.diffusion import Diffusion, Progress
 from model.errors import ModelError
 from model.network import Network
+from model.training_log import TrainingLog
 
 STATE_FILE = "state.safetensors"
 LOG_FILE = "log.csv"
@@ -44,6 +45,14 @@ class TrainingConfig:
     """A coefficient weighs scale^power: 2 is the paper's vertex metric; see `coefficient_weights` (ours)."""
     ema: float = 0.999
     """Decay of the averaged weights (ours)."""
+    feature_dropout: float = 0.0
+    """Share of the speech channels zeroed in a crop (ours)."""
+    weight_decay: float = 0.0
+    """AdamW's, decoupled from the gradient (ours)."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the matrix products; weights, loss and sums stay in float32 (ours)."""
+    device: str = "cpu"
+    """`cpu`, `cuda`, `cuda:1`, … ; one device and one seed repeat to the byte (ours)."""
     candidates: int = 10
     """Checkpoints kept on the way, evenly spaced, for the choice on validation."""
     seed: int = 0
@@ -80,6 +89,63 @@ def objective(x0: Tensor, predicted: Tensor, weights: Tensor, velocity: float) -
     return position + velocity * (change.square() @ weights).sum() / ((frames - 1) * batch)
 
 
+@dataclass(frozen=True)
+class Draws:
+    """The randomness of one step but the crops: t [B] diffusion steps, noise [N, B, K], keep [B], channels [B, W or 1].
+
+    keep: 0 where the speech is zeroed. channels: 0 where a speech channel is, the rest scaled to the same mean.
+    """
+
+    t: Tensor
+    noise: Tensor
+    keep: Tensor
+    channels: Tensor
+
+    def part(self, rows: slice) -> Draws:
+        """Of some of the batch."""
+        return Draws(self.t[rows], self.noise[:, rows], self.keep[rows], self.channels[rows])
+
+    def to(self, device: str) -> Draws:
+        """On a device."""
+        return Draws(*(value.to(device) for value in vars(self).values()))
+
+    @classmethod
+    def of(cls, batch: Batch, steps: int, config: TrainingConfig, generator: torch.Generator) -> Draws:
+        """For a batch, from the generator."""
+        count, width = batch.audio.shape[1:]
+        t = torch.randint(steps, (count,), generator=generator)
+        keep = (torch.rand(count, generator=generator) >= config.unconditional).float()
+        noise = torch.randn(batch.motion.shape, generator=generator)
+        channels = torch.ones(count, 1)
+        if config.feature_dropout:
+            channels = (torch.rand((count, width), generator=generator) >= config.feature_dropout).float()
+            channels = channels / (1 - config.feature_dropout)
+        return cls(t, noise, keep, channels)
+
+
+class Objective(nn.Module):
+    """The loss of a batch under given draws: one module, so that it can be spread over processes as a whole."""
+
+    def __init__(
+        self, network: Network, diffusion: Diffusion, weights: Tensor, config: TrainingConfig
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self._diffusion, self._velocity, self._precision = diffusion, config.velocity, config.precision
+        self.weights: Tensor
+        self.register_buffer("weights", weights, persistent=False)
+
+    def forward(self, batch: Batch, draws: Draws) -> Tensor:
+        """Scalar; see `objective`."""
+        kind = batch.motion.device.type
+        with torch.autocast(kind, torch.bfloat16, enabled=self._precision == "bfloat16"):
+            x_t = self._diffusion.add_noise(batch.motion, draws.t, draws.noise)
+            condition = self.network.condition(batch.audio * draws.channels, draws.keep)
+            output = self.network(x_t, draws.t, condition, batch.style).float()
+        predicted = self._diffusion.x0(output, x_t, draws.t)
+        return objective(batch.motion, predicted, self.weights, self._velocity)
+
+
 class Trainer:
     """Trains a checkpoint's weights on sequences, in a folder that holds all that a continuation needs."""
 
@@ -102,20 +168,29 @@ class Trainer:
         self._checkpoint = checkpoint
         self._tensorboard = tensorboard
         self._crops = Crops(sequences, checkpoint.standardization, self.config.frames)
-        self._weights = coefficient_weights(
+        weights = coefficient_weights(
             torch.from_numpy(checkpoint.standardization.scale), self.config.metric_power
         )
         self._diffusion: Diffusion = checkpoint.diffusion()
         self._network = Network(checkpoint.config)
         self._network.load_state_dict(checkpoint.network)
+        self._objective: nn.Module = Objective(self._network, self._diffusion, weights, self.config)
+        self._objective.to(self.config.device)
+        self._rank, self._world = (0, 1)
+        if distributed.is_initialized():
+            self._rank, self._world = distributed.get_rank(), distributed.get_world_size()
+            self._objective = DistributedDataParallel(self._objective)
         # In the network's own order, which a loaded file does not keep: the average follows tensor by tensor.
-        self._average = {name: checkpoint.network[name].clone() for name in self._network.state_dict()}
-        self._optimizer = torch.optim.Adam(
-            self._network.parameters(), lr=self.config.learning_rate, fused=True
+        self._average = {name: value.clone() for name, value in self._network.state_dict().items()}
+        self._optimizer = torch.optim.AdamW(
+            self._network.parameters(),
+            lr=self.config.learning_rate,
+            weight_decay=self.config.weight_decay,
+            fused=True,
         )
         self._parameters = [p for _, p in self._network.named_parameters()]
         self.step = 0
-        self._losses: list[float] = []
+        self._losses: list[Tensor] = []
         if (self.folder / STATE_FILE).exists():
             self._restore()
 
@@ -125,7 +200,9 @@ class Trainer:
         Raises TrainingDivergedError, naming the iteration; the candidates up to then stay.
         """
         saved = time.monotonic()
-        with _threads(self.config.threads), _Log(self.folder / LOG_FILE, self.step, self._tensorboard) as log:
+        # Of several processes only the first writes.
+        log_file = self.folder / LOG_FILE if self._rank == 0 else None
+        with _threads(self.config.threads), TrainingLog(log_file, self.step, self._tensorboard) as log:
             while self.step < self.config.iterations:
                 self._losses.append(self._iterate())
                 self.step += 1
@@ -133,43 +210,42 @@ class Trainer:
                     log.write(self.step, self._checked_loss())
                     if progress is not None:
                         progress(self.step, self.config.iterations)
+                if self._rank > 0:
+                    continue
                 if self.step in self._candidate_steps():
                     self.checkpoint().save(self._candidate(self.step))
                 if time.monotonic() - saved > self.config.save_seconds:
                     self._save()
                     saved = time.monotonic()
-            self._save()
+            if self._rank == 0:
+                self._save()
+            if self._world > 1:
+                distributed.barrier()
         return [self._candidate(step) for step in self._candidate_steps() if self._candidate(step).exists()]
 
     def checkpoint(self, **changes: Any) -> Checkpoint:
         """The model as it is now."""
-        network = {name: value.detach().clone() for name, value in self._network.state_dict().items()}
-        average = {name: value.clone() for name, value in self._average.items()}
+        network = {name: value.detach().cpu().clone() for name, value in self._network.state_dict().items()}
+        average = {name: value.cpu().clone() for name, value in self._average.items()}
         return self._checkpoint.with_weights(network, average, **changes)
 
-    def _iterate(self) -> float:
+    def _iterate(self) -> Tensor:
         """One step of Adam on one random batch; its loss.
 
-        All randomness comes from (seed, step), so a continued run draws what the uninterrupted one does.
+        All randomness comes from (seed, step), so a continued run draws what the uninterrupted one does. Of several
+        processes each draws all of it and takes its share: their mean gradient is the whole batch's.
         """
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
-        loss = self._loss(self._crops.draw(self.config.batch, generator), generator)
+        batch = self._crops.draw(self.config.batch, generator)
+        draws = Draws.of(batch, self._diffusion.steps, self.config, generator)
+        mine = slice(self._rank, None, self._world)
+        device = self.config.device
+        loss = self._objective(batch.part(mine).to(device), draws.part(mine).to(device))
         self._optimizer.zero_grad()
         loss.backward()
         self._optimizer.step()
         self._follow()
-        return loss.item()
-
-    def _loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """The objective at random diffusion steps, with some audio conditions zeroed."""
-        count = batch.motion.shape[1]
-        t = torch.randint(self._diffusion.steps, (count,), generator=generator)
-        keep = (torch.rand(count, generator=generator) >= self.config.unconditional).float()
-        noise = torch.randn(batch.motion.shape, generator=generator)
-        x_t = self._diffusion.add_noise(batch.motion, t, noise)
-        output = self._network(x_t, t, self._network.condition(batch.audio, keep), batch.style)
-        predicted = self._diffusion.x0(output, x_t, t)
-        return objective(batch.motion, predicted, self._weights, self.config.velocity)
+        return loss.detach()
 
     @torch.no_grad()
     def _follow(self) -> None:
@@ -182,8 +258,11 @@ class Trainer:
         )
 
     def _checked_loss(self) -> float:
-        """Mean loss since the last call."""
-        loss = sum(self._losses) / len(self._losses)
+        """Mean loss since the last call, over all processes, so that they stop together."""
+        mean = torch.stack(self._losses).mean()
+        if self._world > 1:
+            distributed.all_reduce(mean)
+        loss = float(mean) / self._world
         self._losses = []
         limit = 3 * (1 + 2 * self.config.velocity)
         if not math.isfinite(loss) or loss > limit:
@@ -216,7 +295,7 @@ class Trainer:
         for index, parameter in enumerate(self._parameters):
             for name, value in self._optimizer.state[parameter].items():
                 tensors[f"adam.{index}.{name}"] = value
-        tensors["losses"] = torch.tensor(self._losses, dtype=torch.float64)
+        tensors["losses"] = torch.stack(self._losses) if self._losses else torch.zeros(0)
         metadata = {"step": str(self.step), "settings": self._settings()}
         write_atomically(self.folder / STATE_FILE, serialize(tensors, metadata))
 
@@ -228,44 +307,13 @@ class Trainer:
                 f"{path} belongs to a training with other settings or data; remove its folder to start anew"
             )
         self._network.load_state_dict({n: tensors[f"network.{n}"] for n in self._network.state_dict()})
-        self._average = {name: tensors[f"average.{name}"] for name in self._average}
+        self._average = {n: tensors[f"average.{n}"].to(self.config.device) for n in self._average}
         for index, parameter in enumerate(self._parameters):
             names = ("step", "exp_avg", "exp_avg_sq")
-            self._optimizer.state[parameter] = {name: tensors[f"adam.{index}.{name}"] for name in names}
-        self._losses = tensors["losses"].tolist()
+            state = {name: tensors[f"adam.{index}.{name}"].to(self.config.device) for name in names}
+            self._optimizer.state[parameter] = state
+        self._losses = list(tensors["losses"].to(self.config.device))
         self.step = int(metadata["step"])
-
-
-class _Log:
-    """`step,loss` lines in a CSV file, rows beyond a continuation's start removed; TensorBoard beside it."""
-
-    def __init__(self, path: Path, step: int, tensorboard: Path | None) -> None:
-        rows = []
-        if path.exists():
-            with path.open(newline="") as stream:
-                rows = [row for row in csv.reader(stream) if len(row) == 2 and row[0].isdigit()]
-        lines = ["step,loss", *(",".join(row) for row in rows if int(row[0]) <= step)]
-        write_atomically(path, ("\n".join(lines) + "\n").encode())
-        self._stream = path.open("a")
-        self._writer: Any = None
-        if tensorboard is not None:
-            from torch.utils.tensorboard import SummaryWriter
-
-            self._writer = SummaryWriter(str(tensorboard), purge_step=step + 1)
-
-    def __enter__(self) -> _Log:
-        return self
-
-    def write(self, step: int, loss: float) -> None:
-        self._stream.write(f"{step},{loss:.6g}\n")
-        self._stream.flush()
-        if self._writer is not None:
-            self._writer.add_scalar("loss", loss, step)
-
-    def __exit__(self, *_: object) -> None:
-        self._stream.close()
-        if self._writer is not None:
-            self._writer.close()
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from personalize.files import write_atomic
 from personalize.media import VideoWriter, on_video_clock, read_audio, read_frames
 from personalize.quality import frame_reason
+from personalize.render.text import caption
 from personalize.run import RunFolder, read_landmarks, read_track
 from personalize.run import read_frames as read_frame_table
 from tracker.head import load_head
@@ -49,7 +50,8 @@ def write_overlay(run: RunFolder, folder: Path, progress: Callable[[int, int], N
                 preview.write(cv2.resize(picture, small, interpolation=cv2.INTER_AREA), time)
             if frame in shown:
                 scale = height / rgb.shape[0]
-                kept[frame] = _around_face(picture[:, width:], landmarks.points[frame, :, :2] * scale)
+                tile = _around_face(picture[:, width:], landmarks.points[frame, :, :2] * scale)
+                kept[frame] = caption(tile, f"{time:.2f} s, confidence {track.confidence[frame]:.2f}")
             progress(frame + 1, total)
     sheet = contact_sheet([kept[frame] for frame in notable_frames(track.valid, track.confidence)])
     _, png = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))

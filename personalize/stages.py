@@ -137,7 +137,7 @@ class Refine(Stage):
 class Overlay(Stage):
     """The track over the video, to check by eye."""
 
-    name, version = "overlay", 1
+    name, version = "overlay", 2
     needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", "refine/track.npz")
     makes, products = ("contact_sheet.png", "preview.mp4"), ("overlay.mp4",)
 

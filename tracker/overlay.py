@@ -68,7 +68,8 @@ def draw_overlay(rgb: U8, track: Track, frame: int, landmarks: Landmarks, head: 
         detected = (landmarks.points[frame, :, :2] + 0.5) * scale - 0.5
         fitted = project(placed.landmarks, track.focal * scale, principal)
         radius = max(1, round(float(np.ptp(detected[:, 0])) / 200))
-        _draw_points(drawn, detected[head.landmark_embedding.landmarks], DETECTED, radius)
+        # The detected ones are rings around the fitted: where they agree, both are seen.
+        _draw_points(drawn, detected[head.landmark_embedding.landmarks], DETECTED, radius + 1)
         _draw_points(drawn, fitted, FITTED, radius)
     _draw_confidence(drawn, float(track.confidence[frame]), bool(track.valid[frame]), reason)
     return np.concatenate([picture, drawn], axis=1)

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import distributed
 
 from model.checkpoint import Checkpoint
+from model.dataset import Crops
 from model.errors import ModelError
 from model.metrics import score
 from model.synthesis import synthesize
-from model.trainer import LOG_FILE, STATE_FILE, Trainer, TrainingConfig, TrainingDivergedError
+from model.trainer import LOG_FILE, STATE_FILE, Draws, Trainer, TrainingConfig, TrainingDivergedError
 from tests.model import talker
 
 TINY = TrainingConfig(iterations=24, batch=4, frames=12, candidates=3, log_every=5, threads=1)
@@ -129,3 +131,62 @@ def test_what_it_learns_beats_the_mean_on_unseen_motion(tmp_path: Path, parametr
     for name in ("lip_sync", "l2_lip", "l2_face"):
         assert ours[name] < 0.9 * baseline[name], name
     assert ours["lip_gap_r"] > 0.7 and 0.6 < ours["spread"] < 1.3 and ours["velocity"] < 2.0
+
+
+def train_as_one_of_two(rank: int, folder: Path) -> None:
+    distributed.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
+    Trainer(*start(), folder / "two", TINY).train()
+    distributed.destroy_process_group()
+
+
+def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
+    one = Trainer(*start(), tmp_path / "one", TINY).train()
+    torch.multiprocessing.spawn(train_as_one_of_two, (tmp_path,), nprocs=2)
+    for path in one:
+        ours, theirs = weights(path), weights(tmp_path / "two" / path.name)
+        for name, value in ours.items():
+            # Adam divides by the gradient's size, so rounding moves weights whose gradient is almost zero.
+            torch.testing.assert_close(value, theirs[name], atol=1e-3, rtol=1e-3)
+    logs = [(tmp_path / name / LOG_FILE).read_text().split() for name in ("one", "two")]
+    assert len(logs[0]) == len(logs[1])
+
+
+def test_draws_zero_as_many_channels_and_conditions_as_asked() -> None:
+    checkpoint, sequences = start()
+    config = TrainingConfig(unconditional=0.25, feature_dropout=0.5)
+    generator = torch.Generator().manual_seed(0)
+    batch = Crops(sequences, checkpoint.standardization, 12).draw(2000, generator)
+    draws = Draws.of(batch, 500, config, generator)
+    assert abs(float(draws.keep.mean()) - 0.75) < 0.03
+    assert set(draws.channels.unique().tolist()) == {0.0, 2.0}
+    assert abs(float(draws.channels.mean()) - 1) < 0.03
+    assert draws.t.min() >= 0 and draws.t.max() < 500
+    half = draws.part(slice(1, None, 2))
+    assert torch.equal(half.noise, draws.noise[:, 1::2]) and torch.equal(half.t, draws.t[1::2])
+
+
+def test_bfloat16_follows_float32(tmp_path: Path) -> None:
+    losses = []
+    for precision in ("float32", "bfloat16"):
+        config = replace(TINY, iterations=60, precision=precision, log_every=60)
+        Trainer(*start(), tmp_path / precision, config).train()
+        losses.append(float((tmp_path / precision / LOG_FILE).read_text().split(",")[-1]))
+    assert losses[0] != losses[1] and abs(losses[1] / losses[0] - 1) < 0.02
+
+
+def test_weight_decay_shrinks_what_the_data_do_not_ask_for(tmp_path: Path) -> None:
+    norms = []
+    for decay in (0.0, 20.0):
+        config = replace(TINY, weight_decay=decay)
+        path = Trainer(*start(), tmp_path / str(decay), config).train()[-1]
+        norms.append(float(Checkpoint.load(path).network["middle.weight"].norm()))
+    assert norms[1] < 0.8 * norms[0]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cuda_learns_what_the_processor_does(tmp_path: Path) -> None:
+    here = Trainer(*start(), tmp_path / "cpu", TINY).train()[-1]
+    there = Trainer(*start(), tmp_path / "cuda", replace(TINY, device="cuda")).train()[-1]
+    ours, theirs = weights(here), weights(there)
+    for name, value in ours.items():
+        torch.testing.assert_close(value, theirs[name], atol=1e-2, rtol=1e-2)
