@@ -56,9 +56,8 @@ class Guided:
         return torch.cat(pieces)
 
     def _evaluate(self, x: Tensor, t: int, condition: Condition) -> Tensor:
-        """Both branches in one batch."""
-        step = torch.tensor(t)
-        both = x[:, None].expand(-1, 2, -1, -1)
+        """Both branches in one batch; what comes before the first condition is the same for both, and made once."""
+        step, both = torch.tensor(t), x[:, None]
         output = self._network(both, step, condition, self._style)
         conditional, unconditional = self._diffusion.x0(output, both, step).unbind(dim=1)
         return unconditional + self._guidance * (conditional - unconditional)

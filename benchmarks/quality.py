@@ -1,0 +1,157 @@
+"""What personalization learns, on real runs: `python -m benchmarks quality RUN [TEST_RUN] [options]`.
+
+Trains on RUN's train part, chooses the checkpoint on its val part, and tests on its test part; given TEST_RUN, it trains
+on RUN's test part as well and tests on all of TEST_RUN. The runs must have come as far as `registration`.
+
+r               of the lip opening with the reference: mean of 10 samples at s = 1, and of the ridge regression from the
+                same speech features on the same seconds; `training` is on the training seconds
+sd              over samples at s = 0.5 by the motion's own: lip opening, mouth width, eyelid opening
+spread, velocity    of samples, by the subject's own; at s = 0 without the speech
+
+The second table is the guidance curve: div_e and lip_sync for s = 0 ... 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.checkpoint import Checkpoint
+from model.dataset import Sequence
+from model.finetuning import SWEEP, choose_checkpoint, subject_of
+from model.metrics import lip_gap_r, lip_opening_mm, score
+from model.ridge import Ridge
+from model.synthesis import synthesize
+from model.trainer import Trainer, TrainingConfig
+from personalize.run import RunFolder
+from personalize.subject_data import BASE_CHECKPOINT, load_subject_data
+from tracker.head import load_head
+
+F32 = NDArray[np.float32]
+SAMPLES = 10
+CURVE_SAMPLES = 4
+
+
+def signals(checkpoint: Checkpoint, coefficients: F32) -> dict[str, F32]:
+    """Lip opening, mouth width and mean eyelid opening, mm, of coefficients [..., N, K] m: [..., N] each."""
+    regions = load_head().regions
+    mesh = checkpoint.template, checkpoint.basis, checkpoint.regions
+
+    def between(one: int, other: int, axis: int) -> F32:
+        motion = checkpoint.basis[:, one, axis] - checkpoint.basis[:, other, axis]
+        return 1000 * (coefficients @ motion)
+
+    corners, lids = regions["inner_lip_upper"], []
+    for side in ("left", "right"):
+        loops = [regions[f"{side}_eyelid_{part}"] for part in ("upper", "lower")]
+        lids.append(between(*(int(loop[len(loop) // 2]) for loop in loops), 1))
+    return {
+        "lips": lip_opening_mm(*mesh, coefficients),
+        "width": np.abs(between(int(corners[0]), int(corners[-1]), 0)),
+        "lids": (lids[0] + lids[1]) / 2,
+    }
+
+
+def weighted(rows: list[float], sequences: list[Sequence]) -> float:
+    """Mean over sequences by their valid frames."""
+    return float(np.average(rows, weights=[sequence.valid.sum() for sequence in sequences]))
+
+
+def together(checkpoint: Checkpoint, drawn: list[F32], sequences: list[Sequence]) -> dict[str, float]:
+    """Figures of samples [S, N, K] of each sequence, over the valid frames of all."""
+    samples = np.concatenate([d[:, s.valid] for d, s in zip(drawn, sequences)], axis=1)
+    reference = np.concatenate([s.coefficients[s.valid] for s in sequences])
+    ours, true = signals(checkpoint, samples), signals(checkpoint, reference)
+    scores = [score(d, s, checkpoint) for d, s in zip(drawn, sequences)]
+    figures = {name: weighted([row[name] for row in scores], sequences) for name in scores[0]}
+    figures["r"] = lip_gap_r(ours["lips"].mean(0), true["lips"])
+    return figures | {f"sd {name}": float(ours[name].std(0).mean() / true[name].std()) for name in ours}
+
+
+def draw(checkpoint: Checkpoint, sequences: list[Sequence], s: float, samples: int = SAMPLES) -> list[F32]:
+    """Samples [S, N, K] of each sequence."""
+    return [synthesize(checkpoint, q.features, guidance=s, samples=samples, seed=1) for q in sequences]
+
+
+def report(checkpoint: Checkpoint, train: list[Sequence], val: list[Sequence], test: list[Sequence]) -> None:
+    """Both tables."""
+    ridge = Ridge.fit(train, val)
+    predicted = together(checkpoint, [ridge.predict(q.features)[None] for q in test], test)
+    at = {s: together(checkpoint, draw(checkpoint, test, s), test) for s in (0.0, 0.5, 1.0)}
+    longest = sorted(train, key=lambda q: -len(q.valid))[:4]
+    known = together(checkpoint, draw(checkpoint, longest, 1.0, 3), longest)
+    print(f"r     mean of {SAMPLES}, s = 1: {at[1.0]['r']:.3f}   ridge {predicted['r']:.3f}", end="   ")
+    print(f"single {at[1.0]['lip_gap_r']:.3f}   training {known['r']:.3f}")
+    for s, row in at.items():
+        sds = "   ".join(f"{name[3:]} {value:.2f}" for name, value in row.items() if name.startswith("sd "))
+        print(f"s = {s}   sd {sds}   spread {row['spread']:.2f}   velocity {row['velocity']:.2f}")
+    print(f"ridge     spread {predicted['spread']:.2f}   velocity {predicted['velocity']:.2f}")
+    print(f"{'s':>5} {'div_e':>8} {'lip_sync':>9} {'lip_max':>8} {'l2_lip':>8}")
+    for s in SWEEP:
+        row = together(checkpoint, draw(checkpoint, test, s, CURVE_SAMPLES), test)
+        print(
+            f"{s:5.1f} {row['div_e']:8.2f} {row['lip_sync']:9.3f} {row['lip_max']:8.2f} {row['l2_lip']:8.3f}"
+        )
+    print("", flush=True)
+
+
+def main() -> None:
+    """Train and print."""
+    defaults = TrainingConfig()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("test_run", type=Path, nargs="?")
+    parser.add_argument("--iterations", type=int, default=defaults.iterations)
+    parser.add_argument("--learning-rate", type=float, default=defaults.learning_rate)
+    parser.add_argument("--feature-dropout", type=float, default=defaults.feature_dropout)
+    parser.add_argument("--weight-decay", type=float, default=defaults.weight_decay)
+    parser.add_argument("--unconditional", type=float, default=defaults.unconditional)
+    parser.add_argument("--ema", type=float, default=defaults.ema)
+    parser.add_argument("--metric-power", type=float, default=defaults.metric_power)
+    parser.add_argument("--precision", choices=("float32", "bfloat16"), default=defaults.precision)
+    parser.add_argument("--parametrization", choices=("skip", "plain"), default="skip")
+    parser.add_argument("--scratch", action="store_true", help="do not start from the base model's weights")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--last", action="store_true", help="take the last checkpoint, not validation's")
+    options = parser.parse_args()
+    base = Checkpoint.load(BASE_CHECKPOINT)
+    data = load_subject_data(RunFolder.open(options.run), style=len(base.styles))
+    val = data.sequences("val")
+    train = data.sequences("train") + (data.sequences("test") if options.test_run else [])
+    test = data.sequences("test")
+    if options.test_run:
+        other = load_subject_data(RunFolder.open(options.test_run), style=len(base.styles))
+        test = [q for part in ("train", "val", "test") for q in other.sequences(part)]
+    subject = subject_of(base, "subject", train, {})
+    if options.scratch or options.parametrization != base.parametrization:
+        subject = Checkpoint.initial(
+            kind="subject",
+            encoder=base.encoder,
+            styles=subject.styles,
+            basis=base.basis,
+            template=base.template,
+            faces=base.faces,
+            standardization=subject.standardization,
+            regions=base.regions,
+            parametrization=options.parametrization,
+        )
+    names = vars(defaults).keys() & vars(options).keys()
+    config = TrainingConfig(**{name: getattr(options, name) for name in names})
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        candidates = Trainer(subject, train, Path(folder), config).train()
+        best, errors = choose_checkpoint(candidates, val, seed=0)
+        if options.last:
+            best = Checkpoint.load(candidates[-1])
+    print(f"{config.iterations} iterations in {time.perf_counter() - started:.0f} s", end="; ")
+    print(f"validation error of candidates, mm: {' '.join(f'{e:.2f}' for e in errors)}")
+    report(best, train, val, test)
+
+
+if __name__ == "__main__":
+    main()
