@@ -1,7 +1,7 @@
 """What personalization learns, on real runs: `python -m benchmarks quality RUN [TEST_RUN] [options]`.
 
-Trains on RUN's train part, chooses the checkpoint on its val part, and tests on its test part; given TEST_RUN, it trains
-on RUN's test part as well and tests on all of TEST_RUN. The runs must have come as far as `registration`.
+Trains on RUN's train part, chooses the checkpoint on its val part, and tests on its test part; given TEST_RUN, it
+trains on RUN's test part as well and tests on all of TEST_RUN. The runs must have come as far as `registration`.
 
 r               of the lip opening with the reference: mean of 10 samples at s = 1, and of the ridge regression from the
                 same speech features on the same seconds; `training` is on the training seconds
@@ -48,8 +48,8 @@ def signals(checkpoint: Checkpoint, coefficients: F32) -> dict[str, F32]:
 
     corners, lids = regions["inner_lip_upper"], []
     for side in ("left", "right"):
-        loops = [regions[f"{side}_eyelid_{part}"] for part in ("upper", "lower")]
-        lids.append(between(*(int(loop[len(loop) // 2]) for loop in loops), 1))
+        upper, lower = (regions[f"{side}_eyelid_{part}"] for part in ("upper", "lower"))
+        lids.append(between(int(upper[len(upper) // 2]), int(lower[len(lower) // 2]), 1))
     return {
         "lips": lip_opening_mm(*mesh, coefficients),
         "width": np.abs(between(int(corners[0]), int(corners[-1]), 0)),
