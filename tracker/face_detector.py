@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from ai_edge_litert.interpreter import Interpreter
 from numpy.typing import NDArray
 
+from tracker.networks import open_network
 from tracker.track import F32
 
 INPUT_SIZE = 128  # px, side of the network's square input
@@ -111,8 +111,7 @@ class FaceDetector:
 
     def __init__(self, network: bytes, threads: int = 1) -> None:
         """network: the .tflite file's bytes."""
-        self._network = Interpreter(model_content=network, num_threads=threads)
-        self._network.allocate_tensors()
+        self._network = open_network(network, threads)
         self._input = self._network.get_input_details()[0]["index"]
         outputs = {tuple(d["shape"]): d["index"] for d in self._network.get_output_details()}
         self._regressors, self._logits = outputs[(1, 896, 16)], outputs[(1, 896, 1)]

@@ -15,7 +15,6 @@ from importlib.resources import files
 
 import cv2
 import numpy as np
-from ai_edge_litert.interpreter import Interpreter
 from numpy.typing import NDArray
 
 from tracker.face_detector import Face, FaceDetector
@@ -27,6 +26,7 @@ from tracker.landmark_indices import (
     POINTS,
     RIGHT_EYE_OUTER,
 )
+from tracker.networks import open_network
 from tracker.track import F32, Landmarks
 
 INPUT_SIZE = 256  # px, side of the landmark network's square input
@@ -163,8 +163,7 @@ class _Network:
     """A .tflite network with one input, its outputs in the order of their names."""
 
     def __init__(self, content: bytes, threads: int) -> None:
-        self._interpreter = Interpreter(model_content=content, num_threads=threads)
-        self._interpreter.allocate_tensors()
+        self._interpreter = open_network(content, threads)
         self._input = self._interpreter.get_input_details()[0]["index"]
         outputs = sorted(self._interpreter.get_output_details(), key=lambda d: str(d["name"]))
         self._outputs = [d["index"] for d in outputs]

@@ -67,7 +67,7 @@ def draw_overlay(rgb: U8, track: Track, frame: int, landmarks: Landmarks, head: 
         _draw_mesh(drawn, placed.vertices, track.focal * scale, principal, head)
         detected = (landmarks.points[frame, :, :2] + 0.5) * scale - 0.5
         fitted = project(placed.landmarks, track.focal * scale, principal)
-        radius = max(1, round(float(np.ptp(detected[:, 0])) / 200))
+        radius = max(1, round(float(np.ptp(detected[:, 0])) / 300))
         # The detected ones are rings around the fitted: where they agree, both are seen.
         _draw_points(drawn, detected[head.landmark_embedding.landmarks], DETECTED, radius + 1)
         _draw_points(drawn, fitted, FITTED, radius)
