@@ -8,7 +8,7 @@ r               of the lip opening with the reference: mean of 10 samples at s =
 sd              over samples at s = 0.5 by the motion's own: lip opening, mouth width, eyelid opening
 spread, velocity    of samples, by the subject's own; at s = 0 without the speech
 
-The second table is the guidance curve: div_e and lip_sync for s = 0 ... 1.
+The second table (--curve) is the guidance curve: div_e and lip_sync for s = 0 ... 1.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from model.checkpoint import Checkpoint
 from model.dataset import Sequence
+from model.diffusion import STEPS
 from model.finetuning import SWEEP, choose_checkpoint, subject_of
 from model.metrics import lip_gap_r, lip_opening_mm, score
 from model.ridge import Ridge
@@ -73,27 +74,36 @@ def together(checkpoint: Checkpoint, drawn: list[F32], sequences: list[Sequence]
     return figures | {f"sd {name}": float(ours[name].std(0).mean() / true[name].std()) for name in ours}
 
 
-def draw(checkpoint: Checkpoint, sequences: list[Sequence], s: float, samples: int = SAMPLES) -> list[F32]:
+def draw(checkpoint: Checkpoint, sequences: list[Sequence], s: float, samples: int, steps: int) -> list[F32]:
     """Samples [S, N, K] of each sequence."""
-    return [synthesize(checkpoint, q.features, guidance=s, samples=samples, seed=1) for q in sequences]
+    return [
+        synthesize(checkpoint, q.features, guidance=s, samples=samples, seed=1, steps=steps)
+        for q in sequences
+    ]
 
 
-def report(checkpoint: Checkpoint, train: list[Sequence], val: list[Sequence], test: list[Sequence]) -> None:
-    """Both tables."""
+def report(
+    checkpoint: Checkpoint, train: list[Sequence], val: list[Sequence], test: list[Sequence], steps: int
+) -> None:
+    """The first table."""
     ridge = Ridge.fit(train, val)
     predicted = together(checkpoint, [ridge.predict(q.features)[None] for q in test], test)
-    at = {s: together(checkpoint, draw(checkpoint, test, s), test) for s in (0.0, 0.5, 1.0)}
+    at = {s: together(checkpoint, draw(checkpoint, test, s, SAMPLES, steps), test) for s in (0.0, 0.5, 1.0)}
     longest = sorted(train, key=lambda q: -len(q.valid))[:4]
-    known = together(checkpoint, draw(checkpoint, longest, 1.0, 3), longest)
+    known = together(checkpoint, draw(checkpoint, longest, 1.0, 3, steps), longest)
     print(f"r     mean of {SAMPLES}, s = 1: {at[1.0]['r']:.3f}   ridge {predicted['r']:.3f}", end="   ")
     print(f"single {at[1.0]['lip_gap_r']:.3f}   training {known['r']:.3f}")
     for s, row in at.items():
         sds = "   ".join(f"{name[3:]} {value:.2f}" for name, value in row.items() if name.startswith("sd "))
         print(f"s = {s}   sd {sds}   spread {row['spread']:.2f}   velocity {row['velocity']:.2f}")
-    print(f"ridge     spread {predicted['spread']:.2f}   velocity {predicted['velocity']:.2f}")
+    print(f"ridge     spread {predicted['spread']:.2f}   velocity {predicted['velocity']:.2f}", flush=True)
+
+
+def guidance_curve(checkpoint: Checkpoint, test: list[Sequence], steps: int) -> None:
+    """The second table."""
     print(f"{'s':>5} {'div_e':>8} {'lip_sync':>9} {'lip_max':>8} {'l2_lip':>8}")
     for s in SWEEP:
-        row = together(checkpoint, draw(checkpoint, test, s, CURVE_SAMPLES), test)
+        row = together(checkpoint, draw(checkpoint, test, s, CURVE_SAMPLES, steps), test)
         print(
             f"{s:5.1f} {row['div_e']:8.2f} {row['lip_sync']:9.3f} {row['lip_max']:8.2f} {row['l2_lip']:8.3f}"
         )
@@ -117,6 +127,8 @@ def main() -> None:
     parser.add_argument("--parametrization", choices=("skip", "plain"), default="skip")
     parser.add_argument("--scratch", action="store_true", help="do not start from the base model's weights")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--steps", type=int, default=STEPS, help="of sampling")
+    parser.add_argument("--curve", action="store_true", help="print the guidance curve as well")
     parser.add_argument("--last", action="store_true", help="take the last checkpoint, not validation's")
     options = parser.parse_args()
     base = Checkpoint.load(BASE_CHECKPOINT)
@@ -150,7 +162,9 @@ def main() -> None:
             best = Checkpoint.load(candidates[-1])
     print(f"{config.iterations} iterations in {time.perf_counter() - started:.0f} s", end="; ")
     print(f"validation error of candidates, mm: {' '.join(f'{e:.2f}' for e in errors)}")
-    report(best, train, val, test)
+    report(best, train, val, test, options.steps)
+    if options.curve:
+        guidance_curve(best, test, options.steps)
 
 
 if __name__ == "__main__":
