@@ -45,8 +45,8 @@ class TrainingConfig:
     """A coefficient weighs scale^power: 2 is the paper's vertex metric; see `coefficient_weights` (ours)."""
     ema: float = 0.999
     """Decay of the averaged weights (ours)."""
-    feature_dropout: float = 0.0
-    """Share of the speech channels zeroed in a crop (ours)."""
+    feature_dropout: float = 0.3
+    """Share of the speech channels zeroed in a crop: less is learned by heart (ours; docs/method.md)."""
     weight_decay: float = 0.0
     """AdamW's, decoupled from the gradient (ours)."""
     precision: Literal["float32", "bfloat16"] = "float32"
