@@ -8,7 +8,14 @@ from typing import Annotated, Any
 
 import typer
 
-TABLE_WIDTH = 110
+TABLE_WIDTH = 125
+FIGURES = {
+    "div_e": "Div^E",
+    "lip_sync": "Lip-Sync",
+    "lip_max": "Lip-max",
+    "l2_lip_paper": "L2 lip",
+    "l2_face": "L2 face",
+}
 
 
 def train(
@@ -32,19 +39,21 @@ def train(
 ) -> None:
     """Train a base model; on VOCAset by the paper's protocol, with its Tables 1, 3b and 3c. Run again to continue."""
     from personalize.errors import UserError
-    from personalize.reporter import Reporter
-    from personalize.training import train_on_motions, train_on_vocaset
 
     if (vocaset is None) == (motions is None):
         raise UserError("train needs data: give either --vocaset DIR or --motions DIR")
-    if motions is not None:
-        result = train_on_motions(motions, out, iterations, seed, Reporter())
-    elif vocaset is not None and template_mesh is not None:
-        result = train_on_vocaset(vocaset, template_mesh, out, iterations, adapt or [], seed, Reporter())
-    else:
+    if vocaset is not None and template_mesh is None:
         raise UserError(
             "VOCAset holds no faces: give a mesh of its topology with --template-mesh FLAME_sample.ply"
         )
+
+    from personalize.reporter import Reporter
+    from personalize.training import train_on_motions, train_on_vocaset
+
+    if vocaset is not None and template_mesh is not None:
+        result = train_on_vocaset(vocaset, template_mesh, out, iterations, adapt or [], seed, Reporter())
+    elif motions is not None:
+        result = train_on_motions(motions, out, iterations, seed, Reporter())
     if json_:
         typer.echo(json.dumps(result))
     else:
@@ -61,20 +70,13 @@ def _print(result: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("table", "system", "adapted on", title="mm; in brackets the paper's")
-    names = {
-        "div_e": "Div^E",
-        "lip_sync": "Lip-Sync",
-        "lip_max": "Lip-max",
-        "l2_lip_paper": "L2 lip",
-        "l2_face": "L2 face",
-    }
-    for title in names.values():
-        table.add_column(title, justify="right")
+    table = Table(title="mm; in brackets the paper's; - where adaptation diverged")
+    for title in ("table", "system", "adapted on", *FIGURES.values()):
+        table.add_column(title, no_wrap=True, justify="right" if title in FIGURES.values() else "left")
     for row in result["systems"]:
         cells = [
-            f"{'diverged' if row[name] is None else format(row[name], '.2f')} ({paper:.2f})"
-            for name, paper in zip(names, row["paper"])
+            f"{'-' if row[name] is None else format(row[name], '.2f')} ({paper:.2f})"
+            for name, paper in zip(FIGURES, row["paper"])
         ]
         table.add_row(row["table"], row["system"], f"{row['seconds']:.0f} s", *cells)
     Console(width=TABLE_WIDTH).print(table)

@@ -139,7 +139,10 @@ def _trained(
     seed: int,
     report: Reporter,
 ) -> Checkpoint:
-    """Train to the end; the checkpoint that is best on validation, or without validation the last."""
+    """Train to the end; the checkpoint that is best on validation, or without validation the last.
+
+    Nobody's style fits those who validate: all candidates speak in that of the last training subject.
+    """
     trainer = Trainer(untrained, train, work, TrainingConfig(iterations=iterations, seed=seed))
     with report.stage("training"):
         candidates = trainer.train(report.progress)

@@ -10,18 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cli.train import train
+from cli.train import _print, train
 from model.checkpoint import Checkpoint
 from model.dataset import Sequence
 from model.metrics import score
 from model.motion import Motion
 from model.motion_basis import motion_basis
 from model.synthesis import synthesize
+from model.trainer import TrainingDivergedError
 from personalize import protocol
 from personalize.errors import UserError
 from personalize.media import write_wav
 from personalize.mouth import mouth_regions
 from personalize.protocol import METRICS, SYSTEMS, Reference, first_seconds, with_noise
+from personalize.reporter import Reporter
 from personalize.training import read_faces
 from personalize.vocaset import TEST, TRAIN, VAL
 from tests.model import talker
@@ -210,6 +212,29 @@ def test_motion_off_the_basis_counts_in_the_score() -> None:
     off = 0.1 * np.tensordot(sequence.coefficients, talker.basis(), 1) + np.tensordot(rest, outside, 1)
     assert found["l2_face"] == pytest.approx(1000 * np.linalg.norm(off, axis=2).mean(), rel=1e-4)
     assert found["l2_face"] > score(sample, sequence, checkpoint)["l2_face"]
+
+
+def test_an_adaptation_that_diverges_has_no_figures(
+    tmp_path: Path, quick: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def diverge(*_: object) -> None:
+        raise TrainingDivergedError("diverged at iteration 50")
+
+    monkeypatch.setattr(protocol.Trainer, "train", diverge)
+    train_sequences, sequence = [talker.sequence(90, 0)], talker.sequence(90, 1, style=1)
+    base = talker.shaken(talker.checkpoint(train_sequences))
+    judged = Reference(
+        sequence,
+        np.zeros((0, talker.D, 3), np.float32),
+        np.zeros((90, 0), np.float32),
+        np.zeros(1, np.float32),
+    )
+    subject = protocol.Subject("anna", base.template, [sequence], [sequence], [judged])
+    rows = protocol.compare_systems(base, train_sequences, [subject], tmp_path, 60, 0, Reporter())
+    assert all((row[name] is None) == (row["seconds"] > 0) for row in rows for name in METRICS)
+    json.dumps(rows, allow_nan=False)
+    _print({"checkpoint": "base", "modes": 6, "held": 1.0, "systems": rows})
+    assert capsys.readouterr().out.count("- (") == 8 * len(METRICS)
 
 
 def test_the_first_seconds_and_the_noise() -> None:
