@@ -19,10 +19,11 @@ import typer
 from cli.animate import animate
 from cli.demo import demo
 from cli.run import run
+from cli.train import train
 from personalize.errors import UserError
 from personalize.run import tool_version
 
-COMMANDS: dict[str, Callable[..., None]] = {"run": run, "animate": animate, "demo": demo}
+COMMANDS: dict[str, Callable[..., None]] = {"run": run, "animate": animate, "demo": demo, "train": train}
 INPUT_ERROR, BUG, INTERRUPTED = 2, 1, 130
 
 app = typer.Typer(

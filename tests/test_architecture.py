@@ -32,12 +32,16 @@ def test_imports_go_one_way(package: str) -> None:
         assert ours <= ALLOWED[package], f"{path.relative_to(ROOT)} imports {ours - ALLOWED[package]}"
 
 
+# Data sets and head models come as pickles: this one file reads them, and lets none name anything but plain data.
+RESTRICTED_READER = ROOT / "personalize/restricted_pickle.py"
+
+
 def test_nothing_unpickles() -> None:
     for package in ALLOWED:
         for path in (ROOT / package).rglob("*.py"):
             text = path.read_text()
             assert "allow_pickle=True" not in text, path
-            assert "pickle" not in imported_packages(text), path
+            assert "pickle" not in imported_packages(text) or path == RESTRICTED_READER, path
             assert "torch.load(" not in text or "weights_only=True" in text, path
 
 

@@ -51,3 +51,6 @@ def test_what_is_no_video_is_refused_and_leaves_nothing(
 def test_wrong_options_get_one_line(tmp_path: Path) -> None:
     assert_refused(personalize("run", "talk.mp4", "--iterations", "none", cwd=tmp_path), "iterations")
     assert_refused(personalize("animate", "speech.wav", "--subject", "nowhere", cwd=tmp_path), "nowhere")
+    assert_refused(personalize("train", "--out", "base.safetensors", cwd=tmp_path), "--vocaset", "--motions")
+    data = ("--vocaset", "nowhere", "--template-mesh", "m.ply")
+    assert_refused(personalize("train", "--out", "base.safetensors", *data, cwd=tmp_path), "nowhere")

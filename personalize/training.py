@@ -1,0 +1,214 @@
+"""`personalize train`: a base model from VOCAset, by the paper's protocol, or from a folder of tracked motions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from model.checkpoint import Checkpoint
+from model.dataset import Sequence, Standardization
+from model.errors import ModelError
+from model.finetuning import choose_checkpoint
+from model.motion import FPS, Motion, MotionError
+from model.motion_basis import MotionBasis, motion_basis
+from model.speech import SpeechError, load_encoder
+from model.trainer import Trainer, TrainingConfig
+from personalize.corpus import Corpus, check_parts, tested, there
+from personalize.errors import UserError
+from personalize.mouth import mouth_regions
+from personalize.protocol import compare_systems
+from personalize.reporter import Reporter
+from personalize.run import tool_version
+from personalize.subject_data import BASE_CHECKPOINT, speech_features
+from personalize.vocaset import TRAIN, open_vocaset
+
+F32 = NDArray[np.float32]
+
+CHUNK_FRAMES = 256  # of one motion, decoded together
+
+
+def train_on_vocaset(
+    folder: Path, mesh: Path, out: Path, iterations: int, adapt: list[str], seed: int, report: Reporter
+) -> dict[str, Any]:
+    """Train on the training subjects and write `out`; then the paper's tables for the test subjects `adapt`.
+
+    adapt: [] for both. mesh: a .ply or .obj of the data's topology, for its faces. `<out>.work/` holds what a
+    continuation needs.
+
+    Returns {"checkpoint", "modes", "held", "systems"}; held: share of the squared displacement that the basis holds;
+    systems: see `compare_systems`. Raises UserError, in one line, for whatever the user can mend.
+    """
+    with _mendable(folder):
+        data = open_vocaset(folder)
+        faces = read_faces(mesh, data.vertex_count)
+        names, speakers = tested(data, adapt), there(data, TRAIN)
+        check_parts(data, report)
+        work = _work_folder(out)
+        with report.stage("basis"):
+            spoken = [(name, number) for name in speakers for number in data.sentences(name)]
+            motion = motion_basis(lambda: (data.displacements(*place) for place in spoken), seed=seed)
+        corpus = Corpus(data, motion, load_encoder())
+        with report.stage("speech"):
+            train, val = corpus.training(report.progress), corpus.validation()
+        template = np.mean(list(data.templates.values()), axis=0).astype(np.float32)
+        untrained = Checkpoint.initial(
+            kind="base",
+            encoder=corpus.encoder.name,
+            styles=tuple(speakers),
+            basis=motion.basis,
+            template=template,
+            faces=faces,
+            standardization=Standardization.of(train),
+            regions=mouth_regions(template, motion, data.masks),
+            seed=seed,
+            provenance=_provenance("VOCAset", iterations, seed),
+        )
+        base = _trained(untrained, train, val, work / "base", iterations, seed, report)
+        base.save(out)
+        subjects = [corpus.subject(name, len(speakers)) for name in names]
+        systems = compare_systems(base, train, subjects, work, iterations, seed, report)
+    return {"checkpoint": str(out), "modes": len(motion.basis), "held": motion.held, "systems": systems}
+
+
+def train_on_motions(folder: Path, out: Path, iterations: int, seed: int, report: Reporter) -> dict[str, Any]:
+    """Train on every `NAME.npz` (a Motion at 30 fps) of `folder` with its `NAME.wav`, one style each; write `out`.
+
+    Returns {"checkpoint", "modes", "held"}. Raises UserError, in one line, for whatever the user can mend.
+    """
+    with _mendable(folder):
+        motions, work = _read_motions(folder), _work_folder(out)
+        first = next(iter(motions.values()))
+        with report.stage("basis"):
+            basis = motion_basis(lambda: (part for m in motions.values() for part in _decoded(m)), seed=seed)
+        with report.stage("speech"):
+            sequences = [
+                _motion_sequence(motion, basis, folder / f"{name}.wav", style)
+                for style, (name, motion) in enumerate(motions.items())
+            ]
+        embedded = Checkpoint.load(BASE_CHECKPOINT)
+        same = embedded.topology == first.topology
+        untrained = Checkpoint.initial(
+            kind="base",
+            encoder=load_encoder().name,
+            styles=tuple(motions),
+            basis=basis.basis,
+            template=first.template,
+            faces=first.faces,
+            standardization=Standardization.of(sequences),
+            regions=embedded.regions if same else mouth_regions(first.template, basis, {}),
+            seed=seed,
+            provenance=_provenance("tracked motions", iterations, seed),
+        )
+        _trained(untrained, sequences, [], work / "base", iterations, seed, report).save(out)
+    return {"checkpoint": str(out), "modes": len(basis.basis), "held": basis.held}
+
+
+def read_faces(mesh: Path, vertex_count: int) -> NDArray[np.int32]:
+    """Triangles [F, 3] of a .ply or .obj with D vertices, in the file's own order of them. Raises UserError."""
+    if mesh.suffix.lower() not in (".ply", ".obj") or not mesh.is_file():
+        raise UserError(
+            f"{mesh}: a mesh (.ply or .obj) of the data's topology is needed, e.g. FLAME_sample.ply"
+        )
+    try:
+        loaded = trimesh.load(mesh, process=False, force="mesh", skip_materials=True, maintain_order=True)
+        faces = np.asarray(loaded.faces, np.int32).reshape(-1, 3)
+        found = len(loaded.vertices)
+    except Exception as error:  # whatever a parser of foreign text meets in a broken file
+        raise UserError(f"{mesh} is not a readable mesh ({' '.join(str(error).split())[:120]})") from error
+    if found != vertex_count or len(faces) == 0 or not 0 <= faces.min() <= faces.max() < found:
+        raise UserError(
+            f"{mesh} has {found} vertices and {len(faces)} triangles, and the data {vertex_count} vertices:"
+            " give a mesh of the data's topology, e.g. FLAME_sample.ply"
+        )
+    return faces
+
+
+def _trained(
+    untrained: Checkpoint,
+    train: list[Sequence],
+    val: list[Sequence],
+    work: Path,
+    iterations: int,
+    seed: int,
+    report: Reporter,
+) -> Checkpoint:
+    """Train to the end; the checkpoint that is best on validation, or without validation the last.
+
+    Nobody's style fits those who validate: all candidates speak in that of the last training subject.
+    """
+    trainer = Trainer(untrained, train, work, TrainingConfig(iterations=iterations, seed=seed))
+    with report.stage("training"):
+        candidates = trainer.train(report.progress)
+    if not val:
+        return trainer.checkpoint()
+    with report.stage("choice"):
+        return choose_checkpoint(candidates, val, seed)[0]
+
+
+def _read_motions(folder: Path) -> dict[str, Motion]:
+    """Motions by name, of one topology, each with its sound. Raises UserError."""
+    motions = {path.stem: Motion.load(path) for path in sorted(folder.glob("*.npz"))}
+    if not motions:
+        raise UserError(
+            f"{folder} has no NAME.npz with a NAME.wav beside it; give a folder of tracked motions"
+        )
+    topology = next(iter(motions.values())).topology
+    for name, motion in motions.items():
+        if motion.topology != topology or motion.fps != FPS:
+            raise UserError(
+                f"{folder / name}.npz: all motions must be of one topology and at {FPS:.0f} frames a second"
+            )
+        if not (folder / f"{name}.wav").is_file():
+            raise UserError(f"{folder / name}.npz has no sound: {name}.wav is missing")
+    return motions
+
+
+def _decoded(motion: Motion) -> Iterator[F32]:
+    """Displacements [n, D, 3] m of the valid frames, chunk by chunk."""
+    coefficients = motion.coefficients[motion.valid]
+    for start in range(0, len(coefficients), CHUNK_FRAMES):
+        yield replace(motion, coefficients=coefficients[start : start + CHUNK_FRAMES]).displacements()
+
+
+def _motion_sequence(motion: Motion, basis: MotionBasis, sound: Path, style: int) -> Sequence:
+    """The motion in the new basis, with its sound."""
+    times = motion.start_s + np.arange(len(motion.valid)) / motion.fps
+    coefficients = motion.coefficients @ basis.coefficients(motion.basis)
+    return Sequence(coefficients, speech_features(sound, times), motion.valid, style)
+
+
+def _work_folder(out: Path) -> Path:
+    """`<out>.work`, made; UserError where it cannot be."""
+    work = out.with_name(f"{out.name}.work")
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{work}: cannot be written ({error.strerror}); choose another --out") from None
+    return work
+
+
+def _provenance(source: str, iterations: int, seed: int) -> dict[str, Any]:
+    return {
+        "tool": "personalize",
+        "version": tool_version(),
+        "synthetic": False,
+        "source": source,
+        "iterations": iterations,
+        "seed": seed,
+    }
+
+
+@contextmanager
+def _mendable(folder: Path) -> Iterator[None]:
+    """What the packages below say of the user's data, as the user's error."""
+    try:
+        yield
+    except (ModelError, MotionError, SpeechError) as error:
+        raise UserError(f"{folder}: {error}") from error
