@@ -18,9 +18,10 @@ from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.training import MODES, VERTICES, WIDTH, peak_mb
 from model.dataset import Batch
+from model.denoiser import NetworkConfig
 from model.diffusion import STEPS, Diffusion
 from model.motion import FPS
-from model.network import Network, NetworkConfig
+from model.network import Network
 from model.synthesis import CHUNK_ROWS, Guided
 from model.trainer import Draws, Objective, TrainingConfig
 

@@ -15,11 +15,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from model.architectures import build_network
 from model.dataset import Standardization
+from model.denoiser import Architecture, Denoiser, NetworkConfig
 from model.diffusion import Diffusion, Parametrization, Schedule
 from model.errors import ModelError
 from model.motion import FPS, topology_hash
-from model.network import Network, NetworkConfig
 
 SCHEMA = "1"
 Kind = Literal["base", "subject"]
@@ -69,13 +70,16 @@ class Checkpoint:
         seed: int = 0,
         schedule: Schedule = "cosine",
         parametrization: Parametrization = "skip",
+        architecture: Architecture = "conv",
         provenance: dict[str, Any] | None = None,
     ) -> Checkpoint:
-        """An untrained model, its weights drawn from `seed`."""
-        config = NetworkConfig(len(basis), len(standardization.audio_mean), len(styles))
+        """An untrained model, its weights drawn from `seed`; ModelError for an unknown architecture."""
+        config = NetworkConfig(
+            len(basis), len(standardization.audio_mean), len(styles), architecture=architecture
+        )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            state = Network(config).state_dict()
+            state = build_network(config).state_dict()
         return cls(
             kind=kind,
             encoder=encoder,
@@ -102,9 +106,9 @@ class Checkpoint:
         """The diffusion that it was trained with."""
         return Diffusion(self.schedule, self.parametrization)
 
-    def model(self) -> Network:
+    def model(self) -> Denoiser:
         """The network with its averaged weights, ready to evaluate."""
-        network = Network(self.config)
+        network = build_network(self.config)
         network.load_state_dict(self.ema)
         return network.eval().requires_grad_(False)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as Many
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,7 @@ def subject_of(base: Checkpoint, name: str, train: Many[Sequence], provenance: d
     own, old = Standardization.of(train), base.standardization
     standardization = Standardization(own.mean, own.scale, old.audio_mean, old.audio_scale)
     ratio = torch.from_numpy(own.scale / old.scale)
-    config = type(base.config)(
-        base.config.coefficients, base.config.audio_width, len(base.styles) + 1, base.config.channels
-    )
+    config = replace(base.config, styles=len(base.styles) + 1)
 
     def adapt(state: State) -> State:
         styles = state["style.weight"]

@@ -1,57 +1,18 @@
-"""The denoising network: one encoder layer, a full-rate, a half-rate and a restored full-rate block, one
-decoder.
-
-Every tensor has time first, `[N, *batch, channels]`: a convolution is then one matrix product a tap on
-contiguous rows (no gathering of windows), and any batch shape works, e.g. `[N, 2, samples, K]` under
-guidance.
-"""
+"""The paper's denoising network: a full-rate, a half-rate and a restored full-rate block of convolutions."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.denoiser import Condition, Denoiser, NetworkConfig
+
 # An output frame sees at most this many frames to either side, so chunks with this halo (even, because of
 # the half rate) evaluate exactly as the whole does.
 HALO = 8
-# Two frames at half rate are the least that can be reflected.
-MIN_FRAMES = 4
-
-
-@dataclass(frozen=True)
-class NetworkConfig:
-    """Sizes of the network; K coefficients a frame, W speech features a frame."""
-
-    coefficients: int
-    audio_width: int
-    styles: int
-    channels: int = 64
-
-
-@dataclass(frozen=True)
-class Condition:
-    """What the speech adds to the three condition blocks: the audio half of their convolutions, free of x
-    and t.
-
-    full [N, *b, C], half [N/2, *b, 2C], restored [N, *b, C]; b broadcasts against the batch of x.
-    """
-
-    full: Tensor
-    half: Tensor
-    restored: Tensor
-
-    def frames(self, start: int, stop: int) -> Condition:
-        """The frames [start, stop), both even."""
-        return Condition(self.full[start:stop], self.half[start // 2 : stop // 2], self.restored[start:stop])
-
-    def with_unconditional(self) -> Condition:
-        """[N, *b, C] -> [N, 2, *b, C]: the condition, and the zeroed one beside it."""
-        parts = (self.full, self.half, self.restored)
-        return Condition(*(torch.stack([part, torch.zeros_like(part)], dim=1) for part in parts))
 
 
 def reflect(x: Tensor) -> Tensor:
@@ -110,24 +71,19 @@ class Up(TimeConv):
         return torch.stack([even, odd], dim=1).flatten(0, 1)
 
 
-def sinusoidal(steps: Tensor, channels: int) -> Tensor:
-    """Diffusion steps [*b] -> their sinusoidal encoding [*b, channels]."""
-    half = channels // 2
-    rates = torch.exp(-math.log(10_000.0) * torch.arange(half, device=steps.device) / half)
-    angles = steps[..., None].float() * rates
-    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+class Network(Denoiser):
+    """The paper's: convolutions over time, each block followed by one that sees the speech beside the motion
+    (METHOD 2).
+    """
 
-
-class Network(nn.Module):
-    """x_t, step, speech and style -> the raw output, of x_t's shape; `Diffusion.x0` turns it into x0hat."""
+    halo = HALO
+    full_audio: nn.Module
+    low_audio: nn.Module
+    restored_audio: nn.Module
 
     def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        self.config = config
+        super().__init__(config)
         width = config.channels
-        self.encoder = nn.Linear(config.coefficients, width)
-        self.step = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
-        self.audio = nn.Linear(config.audio_width, width)
         # A convolution over [features, audio] side by side is the sum of one over each: kept apart, the
         # audio's part is computed once for all diffusion steps.
         self.full, self.full_audio = TimeConv(width, width), TimeConv(width, width, bias=False)
@@ -136,32 +92,21 @@ class Network(nn.Module):
         self.low, self.low_audio = TimeConv(2 * width, 2 * width), TimeConv(width, 2 * width, bias=False)
         self.up = Up(2 * width, width)
         self.restored, self.restored_audio = TimeConv(width, width), TimeConv(width, width, bias=False)
-        self.style = nn.Embedding(config.styles, width)
-        self.decoder = nn.Linear(width, config.coefficients)
-        nn.init.normal_(self.style.weight, std=0.02)
-        nn.init.zeros_(self.decoder.weight)
-        nn.init.zeros_(self.decoder.bias)
 
     def condition(self, audio: Tensor, keep: Tensor | None = None) -> Condition:
-        """Standardized speech features [N, *b, W], N even -> what they add to the blocks.
-
-        keep [*b] f32: 0 zeroes the audio condition of that element (the unconditional case), 1 keeps it.
-        """
-        code = self.audio(audio)
-        if keep is not None:
-            code = code * keep[..., None]
+        """What the speech adds to the three condition blocks: the audio half of their convolutions."""
+        code = self.hear(audio, keep)
         pairs = (code[0::2] + code[1::2]) / 2
-        return Condition(self.full_audio(code), self.low_audio(pairs), self.restored_audio(code))
+        return Condition((self.full_audio(code), self.low_audio(pairs), self.restored_audio(code)))
 
     def forward(self, x: Tensor, steps: Tensor, condition: Condition, style: Tensor) -> Tensor:
-        """x [N, *b, K] standardized, steps and style integers broadcasting to [*b] -> [N, *b, K]; N even,
-        >= 4.
-        """
-        h = F.silu(self.encoder(x)) + self.step(sinusoidal(steps, self.config.channels).to(x.dtype))
-        h = F.silu(self.full(h) + condition.full)
+        """See `Denoiser`."""
+        full, half, restored = condition.parts
+        h = self.encode(x, steps)
+        h = F.silu(self.full(h) + full)
         h = F.silu(self.down(h))
         h = F.silu(self.middle(h))
-        h = F.silu(self.low(h) + condition.half)
+        h = F.silu(self.low(h) + half)
         h = F.silu(self.up(h))
-        h = F.silu(self.restored(h) + condition.restored)
-        return self.decoder(h + self.style(style))
+        h = F.silu(self.restored(h) + restored)
+        return self.decode(h, style)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.checkpoint import Checkpoint
+from model.denoiser import MIN_FRAMES, Condition, Denoiser
 from model.diffusion import Diffusion, Overwrite, Progress, Rule
 from model.errors import ModelError
-from model.network import HALO, MIN_FRAMES, Condition, Network
 
 # Frames x samples of one evaluation: small enough for the processor's cache, large enough for its matrix
 # products.
@@ -31,18 +31,19 @@ class Keep:
 
 class Guided:
     """x0hat = u + s (c - u) for one audio, any number of samples; long motions in chunks with an exact
-    halo.
+    halo, where the network has one.
     """
 
     def __init__(
-        self, network: Network, diffusion: Diffusion, audio: Tensor, style: int, guidance: float, chunk: int
+        self, network: Denoiser, diffusion: Diffusion, audio: Tensor, style: int, guidance: float, chunk: int
     ) -> None:
-        """audio [N, W] standardized, N even; chunk: frames evaluated together, even."""
+        """audio [N, W] standardized, N even; chunk: frames evaluated together, even, at least four halos."""
         self._network, self._diffusion = network, diffusion
         self._condition = network.condition(audio[:, None]).with_unconditional()
         self._style = torch.tensor(style)
         self._guidance = guidance
-        self._chunk = chunk
+        self._halo = network.halo or 0
+        self._chunk = len(audio) if network.halo is None else max(chunk, 4 * network.halo)
 
     def __call__(self, x: Tensor, t: int) -> Tensor:
         """x [N, S, K] at diffusion step t -> x0hat [N, S, K]."""
@@ -50,7 +51,7 @@ class Guided:
         pieces = []
         for start in range(0, length, self._chunk):
             stop = min(start + self._chunk, length)
-            first, last = max(start - HALO, 0), min(stop + HALO, length)
+            first, last = max(start - self._halo, 0), min(stop + self._halo, length)
             piece = self._evaluate(x[first:last], t, self._condition.frames(first, last))
             pieces.append(piece[start - first : stop - first])
         return torch.cat(pieces)
@@ -116,7 +117,7 @@ def synthesize(
         audio,
         checkpoint.style(style),
         checkpoint.guidance if guidance is None else guidance,
-        chunk=max(CHUNK_ROWS // samples // 2 * 2, 4 * HALO),
+        chunk=CHUNK_ROWS // samples // 2 * 2,
     )
     overwrite = None
     if keep is not None:

@@ -16,11 +16,12 @@ import torch
 from torch import Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from model.architectures import build_network
 from model.checkpoint import Checkpoint, State, read_tensors, serialize, write_atomically
 from model.dataset import Batch, Crops, Sequence
+from model.denoiser import Denoiser
 from model.diffusion import Diffusion, Progress
 from model.errors import ModelError
-from model.network import Network
 from model.training_log import TrainingLog
 
 STATE_FILE = "state.safetensors"
@@ -127,7 +128,7 @@ class Objective(nn.Module):
     """The loss of a batch under given draws: one module, so that it can be spread over processes as a whole."""
 
     def __init__(
-        self, network: Network, diffusion: Diffusion, weights: Tensor, config: TrainingConfig
+        self, network: Denoiser, diffusion: Diffusion, weights: Tensor, config: TrainingConfig
     ) -> None:
         super().__init__()
         self.network = network
@@ -172,7 +173,7 @@ class Trainer:
             torch.from_numpy(checkpoint.standardization.scale), self.config.metric_power
         )
         self._diffusion: Diffusion = checkpoint.diffusion()
-        self._network = Network(checkpoint.config)
+        self._network = build_network(checkpoint.config)
         self._network.load_state_dict(checkpoint.network)
         self._objective: nn.Module = Objective(self._network, self._diffusion, weights, self.config)
         self._objective.to(self.config.device)
@@ -286,7 +287,8 @@ class Trainer:
         settings = asdict(self.config)
         for name in ("threads", "save_seconds", "log_every"):
             del settings[name]
-        return json.dumps(settings | {"crops": len(self._crops)}, sort_keys=True)
+        settings |= {"crops": len(self._crops), "architecture": self._checkpoint.config.architecture}
+        return json.dumps(settings, sort_keys=True)
 
     def _save(self) -> None:
         """State for a continuation, written atomically."""

@@ -42,7 +42,9 @@ def sequence(frames: int, seed: int, style: int = 0, uncertain: float = 0.3) -> 
     )
 
 
-def checkpoint(sequences: list[Sequence], parametrization: str = "skip", styles: int = 1) -> Checkpoint:
+def checkpoint(
+    sequences: list[Sequence], parametrization: str = "skip", styles: int = 1, architecture: str = "conv"
+) -> Checkpoint:
     """Untrained, fitting the sequences."""
     return Checkpoint.initial(
         kind="base",
@@ -54,6 +56,7 @@ def checkpoint(sequences: list[Sequence], parametrization: str = "skip", styles:
         standardization=Standardization.of(sequences),
         regions=REGIONS,
         parametrization=parametrization,
+        architecture=architecture,
     )
 
 

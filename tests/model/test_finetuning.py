@@ -5,22 +5,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from model.architectures import ARCHITECTURES
 from model.dataset import Standardization
 from model.finetuning import SWEEP, choose_checkpoint, subject_of, sweep_guidance
 from model.synthesis import synthesize
 from tests.model import talker
 
 
-def test_the_subject_starts_where_the_base_stands() -> None:
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_the_subject_starts_where_the_base_stands(architecture: str) -> None:
     """Another scale of the coefficients goes into the weights: with the same motion in metres, the same metres."""
     sequences = [talker.sequence(120, seed) for seed in range(3)]
-    base = talker.shaken(talker.checkpoint(sequences))
+    base = talker.shaken(talker.checkpoint(sequences, architecture=architecture))
     subject = subject_of(base, "anna", sequences, {})
+    assert subject.config.architecture == architecture
     assert subject.kind == "subject" and subject.styles == ("person0", "anna")
     assert np.allclose(subject.standardization.scale, base.standardization.scale)
     features = sequences[0].features[:40]
-    ours = synthesize(subject, features, samples=2, seed=1)
-    theirs = synthesize(base, features, samples=2, seed=1)
+    ours = synthesize(subject, features, samples=2, seed=1, steps=50)
+    theirs = synthesize(base, features, samples=2, seed=1, steps=50)
     assert np.allclose(ours, theirs, atol=1e-6)
 
 

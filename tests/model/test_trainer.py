@@ -97,6 +97,8 @@ def test_a_state_of_another_training_is_refused(tmp_path: Path) -> None:
         Trainer(checkpoint, sequences, tmp_path, replace(TINY, learning_rate=3e-4))
     with pytest.raises(ModelError, match="other settings or data"):
         Trainer(checkpoint, sequences[:1], tmp_path, TINY)
+    with pytest.raises(ModelError, match="other settings or data"):
+        Trainer(talker.checkpoint(sequences, architecture="transformer"), sequences, tmp_path, TINY)
     Trainer(checkpoint, sequences, tmp_path, replace(TINY, threads=2, log_every=7))  # changes no result
     (tmp_path / STATE_FILE).write_bytes(b"half")
     with pytest.raises(ModelError, match="not a readable"):
@@ -117,13 +119,19 @@ def test_the_number_of_threads_comes_back(tmp_path: Path) -> None:
     assert torch.get_num_threads() == before
 
 
-@pytest.mark.parametrize("parametrization", ["skip", "plain"])
-def test_what_it_learns_beats_the_mean_on_unseen_motion(tmp_path: Path, parametrization: str) -> None:
+@pytest.mark.parametrize(
+    ("parametrization", "architecture"),
+    [("skip", "conv"), ("plain", "conv"), ("skip", "attention"), ("skip", "transformer")],
+)
+def test_what_it_learns_beats_the_mean_on_unseen_motion(
+    tmp_path: Path, parametrization: str, architecture: str
+) -> None:
     train, unseen = talker.sequence(900, 0), talker.sequence(300, 1)
     config = TrainingConfig(
         iterations=300, batch=16, frames=16, learning_rate=3e-3, ema=0.98, candidates=1, threads=1
     )
-    path = Trainer(talker.checkpoint([train], parametrization), [train], tmp_path, config).train()[-1]
+    untrained = talker.checkpoint([train], parametrization, architecture=architecture)
+    path = Trainer(untrained, [train], tmp_path, config).train()[-1]
     learned = Checkpoint.load(path)
     drawn = synthesize(learned, unseen.features, guidance=1.0, rule="ddim", steps=25, samples=2)
     mean = np.broadcast_to(train.coefficients.mean(0), (1, *unseen.coefficients.shape))
