@@ -15,11 +15,6 @@ from model.denoiser import Condition, Denoiser, NetworkConfig
 HALO = 8
 
 
-def reflect(x: Tensor) -> Tensor:
-    """[N, ...] -> [N + 2, ...], mirrored about the first and the last frame."""
-    return torch.cat([x[1:2], x, x[-2:-1]])
-
-
 class TimeConv(nn.Module):
     """Convolution over time of three taps, reflect padding: [N, *b, in] -> [N, *b, out].
 
