@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from personalize.subject_data import BASE_CHECKPOINT
+from tests.personalize.video_factory import corner_picture, write_video
+
 
 def personalize(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "cli.main", *map(str, arguments)]
@@ -51,3 +54,13 @@ def test_what_is_no_video_is_refused_and_leaves_nothing(
 def test_wrong_options_get_one_line(tmp_path: Path) -> None:
     assert_refused(personalize("run", "talk.mp4", "--iterations", "none", cwd=tmp_path), "iterations")
     assert_refused(personalize("animate", "speech.wav", "--subject", "nowhere", cwd=tmp_path), "nowhere")
+
+
+def test_an_encoder_that_is_not_there_gets_one_line_before_any_work(tmp_path: Path) -> None:
+    video, speech = tmp_path / "talk.mkv", tmp_path / "speech.wav"
+    write_video(video, [corner_picture()] * 10, [0.04 * n for n in range(10)])
+    speech.touch()
+    assert_refused(personalize("run", video, "--encoder", "nowhere", cwd=tmp_path), "nowhere")
+    subject = ("--subject", BASE_CHECKPOINT)
+    assert_refused(personalize("animate", speech, *subject, "--encoder", "nowhere", cwd=tmp_path), "nowhere")
+    assert sorted(tmp_path.iterdir()) == [speech, video]
