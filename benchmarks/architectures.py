@@ -25,6 +25,7 @@ from model.denoiser import Architecture
 from model.diffusion import PARAMETRIZATIONS, STEPS, Parametrization
 from model.metrics import score
 from model.motion import FPS
+from model.speech import load_encoder
 from model.synthesis import synthesize
 from model.trainer import Trainer, TrainingConfig
 from personalize.media import read_audio
@@ -44,7 +45,7 @@ SHORTEST_FRAMES = round(1 * FPS)
 
 def of_runs(runs: list[Path]) -> tuple[list[Sequence], list[Sequence]]:
     """Train and test sequences of runs, their number as their style."""
-    data = [load_subject_data(RunFolder.open(run), style) for style, run in enumerate(runs)]
+    data = [load_subject_data(RunFolder.open(run), style, load_encoder()) for style, run in enumerate(runs)]
     return [q for d in data for q in d.sequences("train")], [q for d in data for q in d.sequences("test")]
 
 
@@ -56,7 +57,8 @@ def made_up(base: Checkpoint, seed: int) -> tuple[list[Sequence], list[Sequence]
     talker = talker_motion(phones, len(audio) / 16000, FPS, seed, Style.random(seed), audio)
     shapes = np.tensordot(head.expression_basis, base.basis, axes=((1, 2), (1, 2)))
     motion = (talker.expression_for(head.expression_names) @ shapes).astype(np.float32)
-    features = speech_features(ASSETS / "demo_speech.flac", start_s + np.arange(len(motion)) / FPS)
+    times = start_s + np.arange(len(motion)) / FPS
+    features = speech_features(ASSETS / "demo_speech.flac", times, load_encoder())
     whole = Sequence(motion, features, np.ones(len(motion), bool))
     cut = 3 * len(motion) // 4
     return [part(whole, 0, cut)], [part(whole, cut, len(motion))]

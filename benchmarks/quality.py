@@ -27,6 +27,7 @@ from model.diffusion import STEPS
 from model.finetuning import SWEEP, choose_checkpoint, subject_of
 from model.metrics import lip_gap_r, lip_opening_mm, score
 from model.ridge import Ridge
+from model.speech import load_encoder
 from model.synthesis import synthesize
 from model.trainer import Trainer, TrainingConfig
 from personalize.run import RunFolder
@@ -131,13 +132,13 @@ def main() -> None:
     parser.add_argument("--curve", action="store_true", help="print the guidance curve as well")
     parser.add_argument("--last", action="store_true", help="take the last checkpoint, not validation's")
     options = parser.parse_args()
-    base = Checkpoint.load(BASE_CHECKPOINT)
-    data = load_subject_data(RunFolder.open(options.run), style=len(base.styles))
+    base, encoder = Checkpoint.load(BASE_CHECKPOINT), load_encoder()
+    data = load_subject_data(RunFolder.open(options.run), len(base.styles), encoder)
     val = data.sequences("val")
     train = data.sequences("train") + (data.sequences("test") if options.test_run else [])
     test = data.sequences("test")
     if options.test_run:
-        other = load_subject_data(RunFolder.open(options.test_run), style=len(base.styles))
+        other = load_subject_data(RunFolder.open(options.test_run), len(base.styles), encoder)
         test = [q for part in ("train", "val", "test") for q in other.sequences(part)]
     subject = subject_of(base, "subject", train, {})
     if options.scratch or options.parametrization != base.parametrization:

@@ -19,10 +19,14 @@ def animate(
         float | None, typer.Option(min=0, max=2, help="Guidance scale; the checkpoint's own if not given.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the first sample.")] = 0,
+    encoder: Annotated[
+        str | None,
+        typer.Option(help="Folder or hub name of the speech encoder that the checkpoint was trained with."),
+    ] = None,
 ) -> None:
     """Animate the subject's face with SPEECH: motion.npz and an mp4 with sound for each sample."""
     from personalize.animation import animate_speech
     from personalize.reporter import Reporter
 
-    for path in animate_speech(speech, subject, out, samples, guidance, seed, Reporter()):
+    for path in animate_speech(speech, subject, out, samples, guidance, seed, encoder, Reporter()):
         typer.echo(path)

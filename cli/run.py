@@ -19,6 +19,13 @@ def run(
     iterations: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = Settings.iterations,
     seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = Settings.seed,
     focal: Annotated[float | None, typer.Option(min=1, help="Focal length in pixels, if known.")] = None,
+    base: Annotated[
+        Path | None, typer.Option(help="Checkpoint to fine-tune; the embedded base model if not given.")
+    ] = None,
+    encoder: Annotated[
+        str | None,
+        typer.Option(help="Folder or hub name of the speech encoder that --base was trained with."),
+    ] = None,
     until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
     from_: Annotated[
         str | None, typer.Option("--from", metavar="STAGE", help="Make again from here on.")
@@ -29,7 +36,13 @@ def run(
     """Track the face in VIDEO, fine-tune the model on it, and report. Run it again to continue or to change."""
     from personalize.pipeline import personalize_video
 
-    settings = Settings(iterations=iterations, seed=seed, focal_px=focal)
+    settings = Settings(
+        iterations=iterations,
+        seed=seed,
+        focal_px=focal,
+        base=None if base is None else str(base),
+        encoder=encoder,
+    )
     result = personalize_video(video, out, settings, first=from_, until=until, force=force)
     if json_:
         typer.echo(json.dumps({name: str(path) for name, path in result.items()}))

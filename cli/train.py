@@ -34,6 +34,9 @@ def train(
         list[str] | None,
         typer.Option(metavar="SUBJECT", help="Test subject to adapt to (may repeat); both if not given."),
     ] = None,
+    encoder: Annotated[
+        str | None, typer.Option(help="Speech encoder: folder or hub name; the embedded one if not given.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
@@ -51,9 +54,11 @@ def train(
     from personalize.training import train_on_motions, train_on_vocaset
 
     if vocaset is not None and template_mesh is not None:
-        result = train_on_vocaset(vocaset, template_mesh, out, iterations, adapt or [], seed, Reporter())
+        result = train_on_vocaset(
+            vocaset, template_mesh, out, iterations, adapt or [], seed, encoder, Reporter()
+        )
     elif motions is not None:
-        result = train_on_motions(motions, out, iterations, seed, Reporter())
+        result = train_on_motions(motions, out, iterations, seed, encoder, Reporter())
     if json_:
         typer.echo(json.dumps(result))
     else:

@@ -173,8 +173,9 @@ class Checkpoint:
             )
         if encoder is not None and checkpoint.encoder != encoder:
             raise ModelError(
-                f"{path} was trained on the speech encoder {checkpoint.encoder!r}, and {encoder!r} is needed:"
-                " give a checkpoint of this encoder"
+                f"{path} needs the speech encoder {checkpoint.encoder!r} that it was trained with, and got"
+                f" {encoder!r}: give that one's folder or hub name with --encoder (without it, the embedded one"
+                " is taken), or another checkpoint"
             )
         return checkpoint
 

@@ -32,11 +32,13 @@ def animate_speech(
     samples: int,
     guidance: float | None,
     seed: int,
+    encoder: str | None,
     report: Reporter,
 ) -> Iterator[Path]:
     """Write `motion.npz` and `animation.mp4` of each sample; yields their paths.
 
     subject: a run folder or a checkpoint file. With several samples each lies in a folder of its own, `0`, `1`, …
+    encoder: folder or hub name of the speech encoder that the checkpoint needs; None for the embedded one.
     Raises UserError for sound or checkpoint that cannot be used, and for an output that cannot be written.
     """
     path = subject / "checkpoint.safetensors" if subject.is_dir() else subject
@@ -45,14 +47,15 @@ def animate_speech(
             f"{subject}: no checkpoint there; give a finished run folder or a checkpoint.safetensors"
         )
     try:
-        checkpoint = Checkpoint.load(path, encoder=load_encoder().name)
+        speech_encoder = load_encoder(encoder)
+        checkpoint = Checkpoint.load(path, encoder=speech_encoder.name)
     except ModelError as error:
         raise UserError(str(error)) from error
     sound, _ = read_audio(speech, AUDIO_RATE)
     if not np.any(np.abs(sound) > 1e-4):
         raise UserError(f"{speech}: there is no sound in it; give a recording of speech")
     seconds = len(sound) / AUDIO_RATE
-    features = speech_features(speech, np.arange(max(1, round(seconds * FPS))) / FPS)
+    features = speech_features(speech, np.arange(max(1, round(seconds * FPS))) / FPS, speech_encoder)
     s = checkpoint.guidance if guidance is None else guidance
     with report.stage("synthesis"):
         motions = synthesize(

@@ -43,6 +43,7 @@ class Corpus:
         return Subject(
             name=name,
             template=self.data.templates[name],
+            encoder=self.encoder,
             train=self._sequences(name, ADAPT_TRAIN, style),
             val=self._sequences(name, ADAPT_VAL, style),
             test=[self._reference(name, n, style) for n in self.data.sentences(name) if n in UNSHARED],

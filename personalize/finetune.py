@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from model.checkpoint import Checkpoint
 from model.finetuning import choose_checkpoint, subject_of, sweep_guidance
 from model.speech import load_encoder
 from model.trainer import Trainer, TrainingConfig
@@ -14,7 +13,7 @@ from personalize.files import sha256_file, write_json
 from personalize.reporter import Reporter
 from personalize.run import RunFolder, tool_version
 from personalize.settings import Settings
-from personalize.subject_data import BASE_CHECKPOINT, load_subject_data
+from personalize.subject_data import base_path, load_base, load_subject_data
 
 
 def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Reporter) -> None:
@@ -22,8 +21,8 @@ def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
 
     Raises UserError when the clip holds too little speech with a tracked face in one of the parts of its split.
     """
-    base = Checkpoint.load(BASE_CHECKPOINT, encoder=load_encoder().name)
-    data = load_subject_data(run, style=len(base.styles))
+    base = load_base(settings)
+    data = load_subject_data(run, style=len(base.styles), encoder=load_encoder(settings.encoder))
     for part in ("train", "val", "test"):
         if not data.parts[part]:
             raise UserError(
@@ -33,7 +32,7 @@ def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     provenance = {
         "tool": "personalize",
         "version": tool_version(),
-        "base": sha256_file(BASE_CHECKPOINT),
+        "base": sha256_file(base_path(settings)),
         "video": run.video_sha256,
         "iterations": settings.iterations,
         "seed": settings.seed,

@@ -22,6 +22,7 @@ from personalize.stages import (
     Registration,
     TrackStage,
 )
+from personalize.subject_data import load_base
 from tracker.track import TrackError
 
 STAGES: tuple[Stage, ...] = (
@@ -54,6 +55,10 @@ def personalize_video(
     Raises UserError for whatever the user can mend.
     """
     probe(video)
+    try:
+        load_base(settings)  # asked now, not after the tracking
+    except ModelError as error:
+        raise UserError(str(error)) from error
     folder = out or Path(f"{video.stem}.personalize")
     report = report or Reporter()
     # Asked before the lock so that a folder which is not ours is left as it is, and again once nobody else writes.

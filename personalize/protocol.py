@@ -16,9 +16,10 @@ from model.dataset import Sequence
 from model.finetuning import choose_checkpoint, subject_of
 from model.metrics import score
 from model.motion import FPS
-from model.speech import SpeechEncoder, load_encoder, resample
+from model.speech import SpeechEncoder, resample
 from model.synthesis import synthesize
 from model.trainer import Trainer, TrainingConfig, TrainingDivergedError
+from personalize.feature_cache import encode_cached
 from personalize.files import write_json
 from personalize.reporter import Reporter
 
@@ -81,10 +82,11 @@ class Reference:
 
 @dataclass(frozen=True)
 class Subject:
-    """A test subject: template [D, 3] m, and the parts 18/2/20 of its sentences."""
+    """A test subject: template [D, 3] m, the parts 18/2/20 of its sentences, and what encodes their sound."""
 
     name: str
     template: F32
+    encoder: SpeechEncoder
     train: list[Sequence]
     val: list[Sequence]
     test: list[Reference]
@@ -92,7 +94,7 @@ class Subject:
 
 def speech_at(audio: F32, frames: int, encoder: SpeechEncoder) -> F32:
     """Features [frames, W] of sound [S] at 16 kHz at the motion's frames."""
-    features, times = encoder.encode(audio)
+    features, times = encode_cached(encoder, audio)
     return resample(features, times, np.arange(frames) / FPS)
 
 
@@ -226,7 +228,7 @@ def _judge(model: Checkpoint, subject: Subject, system: System, seed: int) -> di
         features = sentence.sequence.features
         if system.noise_db is not None:
             noisy = with_noise(sentence.audio, system.noise_db, seed + index)
-            features = speech_at(noisy, len(features), load_encoder())
+            features = speech_at(noisy, len(features), subject.encoder)
         samples = synthesize(model, features, guidance=system.guidance, samples=SAMPLES, seed=seed + index)
         rows.append(sentence.score(samples, model))
         frames.append(len(features))

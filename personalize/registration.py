@@ -22,7 +22,8 @@ from personalize.files import write_json
 from personalize.media import read_audio
 from personalize.reporter import Reporter
 from personalize.run import RunFolder, read_frames, read_track, tool_version
-from personalize.subject_data import BASE_CHECKPOINT
+from personalize.settings import Settings
+from personalize.subject_data import base_path
 from tracker.head import HeadModel, load_head
 from tracker.track import Track
 
@@ -62,11 +63,11 @@ class Transfer:
         return np.einsum("dc,...dcx->...dx", self.weights, values[..., self.corners, :]).astype(np.float32)
 
 
-def register_run(run: RunFolder, folder: Path, report: Reporter) -> None:
+def register_run(run: RunFolder, settings: Settings, folder: Path, report: Reporter) -> None:
     """Write motion.npz and registration.json of a run: the motion, and where its sound lies on its clock."""
     frames = read_frames(run.path / "ingest/frames.npz")
     track = read_track(run.path / "refine/track.npz")
-    base = Checkpoint.load(BASE_CHECKPOINT)
+    base = Checkpoint.load(base_path(settings))
     motion, facts = register(
         track, frames.segment, load_head(), BaseFace(base.template, base.faces, base.basis)
     )

@@ -12,8 +12,12 @@ class Settings:
     iterations: fine-tuning steps (the paper: 30 000).
     seed: seed of every random draw.
     focal_px: focal length in pixels, None to estimate it.
+    base: checkpoint that fine-tuning starts from, None for the embedded one.
+    encoder: folder or hub name of the speech encoder that `base` was trained with, None for the embedded one.
     """
 
     iterations: int = 30_000
     seed: int = 0
     focal_px: float | None = None
+    base: str | None = None
+    encoder: str | None = None

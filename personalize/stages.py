@@ -21,7 +21,7 @@ from personalize.quality import write_quality
 from personalize.registration import register_run
 from personalize.settings import Settings
 from personalize.stage import VIDEO, Context, Stage
-from personalize.subject_data import BASE_CHECKPOINT
+from personalize.subject_data import base_path
 from tracker.camera import estimate_camera
 from tracker.fit import fit_track
 from tracker.head import load_head
@@ -33,6 +33,11 @@ LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_la
 @cache
 def _asset_hash(path: Path) -> str:
     return sha256_file(path)
+
+
+def speech_model_assets(settings: Settings) -> dict[str, str]:
+    """The base model and the speech encoder, by content."""
+    return {"base": _asset_hash(base_path(settings)), "encoder": load_encoder(settings.encoder).name}
 
 
 class Ingest(Stage):
@@ -153,10 +158,10 @@ class Registration(Stage):
     makes = ("motion.npz", "registration.json")
 
     def assets(self, settings: Settings) -> dict[str, str]:
-        return {"head": load_head().sha256, "base": _asset_hash(BASE_CHECKPOINT)}
+        return {"head": load_head().sha256, "base": _asset_hash(base_path(settings))}
 
     def make(self, context: Context, folder: Path) -> None:
-        register_run(context.run, folder, context.report)
+        register_run(context.run, context.settings, folder, context.report)
 
 
 class Finetune(Stage):
@@ -172,7 +177,7 @@ class Finetune(Stage):
     makes, products = ("log.csv", "guidance.json"), ("checkpoint.safetensors",)
 
     def assets(self, settings: Settings) -> dict[str, str]:
-        return {"base": _asset_hash(BASE_CHECKPOINT), "encoder": load_encoder().name}
+        return speech_model_assets(settings)
 
     def make(self, context: Context, folder: Path) -> None:
         finetune_run(context.run, context.settings, folder, context.report)
@@ -187,6 +192,9 @@ class Evaluate(Stage):
         *("overlay/preview.mp4", "overlay/contact_sheet.png", "refine/track.npz"),
     )
     makes, products = ("metrics.json", "samples/test.mp4", "samples/test.npz"), ("report.html",)
+
+    def assets(self, settings: Settings) -> dict[str, str]:
+        return speech_model_assets(settings)
 
     def make(self, context: Context, folder: Path) -> None:
         evaluation = evaluate_run(context.run, context.settings, folder, context.report)

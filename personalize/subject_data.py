@@ -9,11 +9,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from model.checkpoint import Checkpoint
 from model.dataset import Sequence
 from model.motion import Motion
-from model.speech import load_encoder, resample
+from model.speech import SpeechEncoder, load_encoder, resample
+from personalize.feature_cache import encode_cached
 from personalize.media import read_audio
 from personalize.run import RunFolder
+from personalize.settings import Settings
 
 BASE_CHECKPOINT = Path(__file__).parent.parent / "model" / "assets" / "base.safetensors"
 Part = Literal["train", "val", "test"]
@@ -45,19 +48,29 @@ class SubjectData:
         return [span.sequence for span in self.parts[part]]
 
 
-def speech_features(sound: Path, at: NDArray[np.float64]) -> NDArray[np.float32]:
+def base_path(settings: Settings) -> Path:
+    """The checkpoint that fine-tuning starts from."""
+    return BASE_CHECKPOINT if settings.base is None else Path(settings.base)
+
+
+def load_base(settings: Settings) -> Checkpoint:
+    """That checkpoint. Raises ModelError where it was not trained with the settings' speech encoder."""
+    return Checkpoint.load(base_path(settings), encoder=load_encoder(settings.encoder).name)
+
+
+def speech_features(sound: Path, at: NDArray[np.float64], encoder: SpeechEncoder) -> NDArray[np.float32]:
     """Features [N, W] of a sound file at times [N] s of its own clock."""
     audio, start_s = read_audio(sound)
-    features, times = load_encoder().encode(audio)
+    features, times = encode_cached(encoder, audio)
     return resample(features, times + start_s, at)
 
 
-def load_subject_data(run: RunFolder, style: int) -> SubjectData:
+def load_subject_data(run: RunFolder, style: int, encoder: SpeechEncoder) -> SubjectData:
     """Read motion, sound and split of a run. `style`: the row of the style table its sequences get."""
     motion = Motion.load(run.path / "registration/motion.npz")
     offset = float(run.read_json("registration/registration.json")["av_offset_s"])
     times = motion.start_s + np.arange(len(motion.valid)) / motion.fps
-    features = speech_features(run.path / "ingest/audio.wav", times + offset)
+    features = speech_features(run.path / "ingest/audio.wav", times + offset, encoder)
     split = run.read_json("ingest/split.json")
     parts: dict[str, list[Span]] = {}
     for part in ("train", "val", "test"):

@@ -18,7 +18,8 @@ from model.errors import ModelError
 from model.finetuning import choose_checkpoint
 from model.motion import FPS, Motion, MotionError
 from model.motion_basis import MotionBasis, motion_basis
-from model.speech import SpeechError, load_encoder
+from model.speech import SpeechEncoder, load_encoder
+from model.speech_windows import SpeechError
 from model.trainer import Trainer, TrainingConfig
 from personalize.corpus import Corpus, check_parts, tested, there
 from personalize.errors import UserError
@@ -35,12 +36,19 @@ CHUNK_FRAMES = 256  # of one motion, decoded together
 
 
 def train_on_vocaset(
-    folder: Path, mesh: Path, out: Path, iterations: int, adapt: list[str], seed: int, report: Reporter
+    folder: Path,
+    mesh: Path,
+    out: Path,
+    iterations: int,
+    adapt: list[str],
+    seed: int,
+    encoder: str | None,
+    report: Reporter,
 ) -> dict[str, Any]:
     """Train on the training subjects and write `out`; then the paper's tables for the test subjects `adapt`.
 
-    adapt: [] for both. mesh: a .ply or .obj of the data's topology, for its faces. `<out>.work/` holds what a
-    continuation needs.
+    adapt: [] for both. encoder: None for the embedded one, else a folder or hub name. mesh: a .ply or .obj of the
+    data's topology, for its faces. `<out>.work/` holds what a continuation needs.
 
     Returns {"checkpoint", "modes", "held", "systems"}; held: share of the squared displacement that the basis holds;
     systems: see `compare_systems`. Raises UserError, in one line, for whatever the user can mend.
@@ -54,7 +62,7 @@ def train_on_vocaset(
         with report.stage("basis"):
             spoken = [(name, number) for name in speakers for number in data.sentences(name)]
             motion = motion_basis(lambda: (data.displacements(*place) for place in spoken), seed=seed)
-        corpus = Corpus(data, motion, load_encoder())
+        corpus = Corpus(data, motion, load_encoder(encoder))
         with report.stage("speech"):
             train, val = corpus.training(report.progress), corpus.validation()
         template = np.mean(list(data.templates.values()), axis=0).astype(np.float32)
@@ -77,26 +85,28 @@ def train_on_vocaset(
     return {"checkpoint": str(out), "modes": len(motion.basis), "held": motion.held, "systems": systems}
 
 
-def train_on_motions(folder: Path, out: Path, iterations: int, seed: int, report: Reporter) -> dict[str, Any]:
+def train_on_motions(
+    folder: Path, out: Path, iterations: int, seed: int, encoder: str | None, report: Reporter
+) -> dict[str, Any]:
     """Train on every `NAME.npz` (a Motion at 30 fps) of `folder` with its `NAME.wav`, one style each; write `out`.
 
     Returns {"checkpoint", "modes", "held"}. Raises UserError, in one line, for whatever the user can mend.
     """
     with _mendable(folder):
-        motions, work = _read_motions(folder), _work_folder(out)
+        motions, work, speech = _read_motions(folder), _work_folder(out), load_encoder(encoder)
         first = next(iter(motions.values()))
         with report.stage("basis"):
             basis = motion_basis(lambda: (part for m in motions.values() for part in _decoded(m)), seed=seed)
         with report.stage("speech"):
             sequences = [
-                _motion_sequence(motion, basis, folder / f"{name}.wav", style)
+                _motion_sequence(motion, basis, folder / f"{name}.wav", speech, style)
                 for style, (name, motion) in enumerate(motions.items())
             ]
         embedded = Checkpoint.load(BASE_CHECKPOINT)
         same = embedded.topology == first.topology
         untrained = Checkpoint.initial(
             kind="base",
-            encoder=load_encoder().name,
+            encoder=speech.name,
             styles=tuple(motions),
             basis=basis.basis,
             template=first.template,
@@ -177,11 +187,13 @@ def _decoded(motion: Motion) -> Iterator[F32]:
         yield replace(motion, coefficients=coefficients[start : start + CHUNK_FRAMES]).displacements()
 
 
-def _motion_sequence(motion: Motion, basis: MotionBasis, sound: Path, style: int) -> Sequence:
+def _motion_sequence(
+    motion: Motion, basis: MotionBasis, sound: Path, encoder: SpeechEncoder, style: int
+) -> Sequence:
     """The motion in the new basis, with its sound."""
     times = motion.start_s + np.arange(len(motion.valid)) / motion.fps
     coefficients = motion.coefficients @ basis.coefficients(motion.basis)
-    return Sequence(coefficients, speech_features(sound, times), motion.valid, style)
+    return Sequence(coefficients, speech_features(sound, times, encoder), motion.valid, style)
 
 
 def _work_folder(out: Path) -> Path:

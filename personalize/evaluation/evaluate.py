@@ -19,7 +19,7 @@ from personalize.files import write_json, write_npz
 from personalize.reporter import Reporter
 from personalize.run import RunFolder
 from personalize.settings import Settings
-from personalize.subject_data import BASE_CHECKPOINT, Span, SubjectData, load_subject_data
+from personalize.subject_data import Span, SubjectData, base_path, load_subject_data
 
 F32 = NDArray[np.float32]
 
@@ -68,9 +68,10 @@ def evaluate_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
 
     A metric is the mean over the test spans, weighted by their frames; over samples where a system draws several.
     """
-    subject = Checkpoint.load(run.path / "checkpoint.safetensors", encoder=load_encoder().name)
-    base = Checkpoint.load(BASE_CHECKPOINT, topology=subject.topology, encoder=subject.encoder)
-    data = load_subject_data(run, style=len(subject.styles) - 1)
+    encoder = load_encoder(settings.encoder)
+    subject = Checkpoint.load(run.path / "checkpoint.safetensors", encoder=encoder.name)
+    base = Checkpoint.load(base_path(settings), topology=subject.topology, encoder=encoder.name)
+    data = load_subject_data(run, style=len(subject.styles) - 1, encoder=encoder)
     spans = data.parts["test"]
     systems: dict[str, dict[str, float]] = {}
     clip_span = max(spans, key=lambda span: int(span.sequence.valid.sum()))

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from personalize.subject_data import BASE_CHECKPOINT
+from tests.personalize.video_factory import corner_picture, write_video
+
 
 def personalize(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "cli.main", *map(str, arguments)]
@@ -54,3 +57,13 @@ def test_wrong_options_get_one_line(tmp_path: Path) -> None:
     assert_refused(personalize("train", "--out", "base.safetensors", cwd=tmp_path), "--vocaset", "--motions")
     data = ("--vocaset", "nowhere", "--template-mesh", "m.ply")
     assert_refused(personalize("train", "--out", "base.safetensors", *data, cwd=tmp_path), "nowhere")
+
+
+def test_an_encoder_that_is_not_there_gets_one_line_before_any_work(tmp_path: Path) -> None:
+    video, speech = tmp_path / "talk.mkv", tmp_path / "speech.wav"
+    write_video(video, [corner_picture()] * 10, [0.04 * n for n in range(10)])
+    speech.touch()
+    assert_refused(personalize("run", video, "--encoder", "nowhere", cwd=tmp_path), "nowhere")
+    subject = ("--subject", BASE_CHECKPOINT)
+    assert_refused(personalize("animate", speech, *subject, "--encoder", "nowhere", cwd=tmp_path), "nowhere")
+    assert sorted(tmp_path.iterdir()) == [speech, video]

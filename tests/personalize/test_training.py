@@ -16,6 +16,7 @@ from model.dataset import Sequence
 from model.metrics import score
 from model.motion import Motion
 from model.motion_basis import motion_basis
+from model.speech import load_encoder
 from model.synthesis import synthesize
 from model.trainer import TrainingDivergedError
 from personalize import protocol
@@ -229,7 +230,7 @@ def test_an_adaptation_that_diverges_has_no_figures(
         np.zeros((90, 0), np.float32),
         np.zeros(1, np.float32),
     )
-    subject = protocol.Subject("anna", base.template, [sequence], [sequence], [judged])
+    subject = protocol.Subject("anna", base.template, load_encoder(), [sequence], [sequence], [judged])
     rows = protocol.compare_systems(base, train_sequences, [subject], tmp_path, 60, 0, Reporter())
     assert all((row[name] is None) == (row["seconds"] > 0) for row in rows for name in METRICS)
     json.dumps(rows, allow_nan=False)

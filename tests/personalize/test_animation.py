@@ -1,0 +1,71 @@
+"""New speech for a checkpoint: its encoder hears the sound once, whatever is sampled from it."""
+
+import io
+import wave
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.motion import Motion
+from personalize import animation
+from personalize.animation import animate_speech
+from personalize.errors import UserError
+from personalize.reporter import Reporter
+from tests.model import talker
+from tests.personalize.counting_encoder import CountingEncoder
+
+
+@pytest.fixture
+def encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CountingEncoder:
+    """In place of any other; films are left out, and nothing is cached yet."""
+    encoder = CountingEncoder()
+    monkeypatch.setattr(animation, "load_encoder", lambda source: encoder)
+    monkeypatch.setattr(animation, "write_film", lambda *_: None)
+    monkeypatch.setenv("PERSONALIZE_CACHE", str(tmp_path / "cache"))
+    return encoder
+
+
+@pytest.fixture
+def speech(tmp_path: Path) -> Path:
+    sound = np.random.default_rng(0).integers(-9000, 9000, 16_000).astype("<i2")
+    path = tmp_path / "speech.wav"
+    with wave.open(str(path), "wb") as file:
+        file.setparams((1, 2, 16_000, 0, "NONE", ""))
+        file.writeframes(sound.tobytes())
+    return path
+
+
+@pytest.fixture
+def subject(tmp_path: Path) -> Path:
+    path = tmp_path / "checkpoint.safetensors"
+    talker.shaken(talker.checkpoint([talker.sequence(90, 0)])).save(path)
+    return path
+
+
+def animate(speech: Path, subject: Path, out: Path, samples: int, encoder: str | None = None) -> list[Path]:
+    report = Reporter(stream=io.StringIO())
+    return list(animate_speech(speech, subject, out, samples, None, 0, encoder, report))
+
+
+def test_sound_is_encoded_once_for_all_samples_and_steps_and_not_again(
+    encoder: CountingEncoder, speech: Path, subject: Path, tmp_path: Path
+) -> None:
+    animate(speech, subject, tmp_path / "out", samples=3)
+    assert encoder.calls == 1
+    motions = [Motion.load(tmp_path / f"out/{index}/motion.npz") for index in range(3)]
+    assert all(len(motion.valid) == 30 for motion in motions)
+    animate(speech, subject, tmp_path / "again", samples=3)
+    assert encoder.calls == 1, "the second time the features come from the cache"
+    again = Motion.load(tmp_path / "again/1/motion.npz")
+    assert again.coefficients.tobytes() == motions[1].coefficients.tobytes()
+
+
+def test_a_checkpoint_of_another_encoder_says_which_and_how(
+    encoder: CountingEncoder, speech: Path, subject: Path, tmp_path: Path
+) -> None:
+    encoder.name = "wav2vec2#layer=12@0123"
+    with pytest.raises(UserError, match=r"needs the speech encoder 'test' .* with --encoder") as caught:
+        animate(speech, subject, tmp_path / "out", samples=1)
+    assert "wav2vec2#layer=12@0123" in str(caught.value) and "\n" not in str(caught.value)
+    assert encoder.calls == 0 and not (tmp_path / "out").exists()
