@@ -19,9 +19,11 @@ def orthonormal(rows: NDArray[np.floating]) -> tuple[F32, F64]:
     rows = mixing · basis, so coefficients c of the rows are c · mixing in the basis.
     """
     flat = rows.reshape(len(rows), -1).astype(np.float64)
-    left, values, right = np.linalg.svd(flat, full_matrices=False)
+    # By way of a small square: the decomposition of the whole takes ten times as long.
+    frame, triangle = np.linalg.qr(flat.T)
+    left, values, right = np.linalg.svd(triangle.T, full_matrices=False)
     rank = max(1, int((values > RANK_TOLERANCE * values[0]).sum()))
-    basis = right[:rank].reshape(rank, *rows.shape[1:]).astype(np.float32)
+    basis = (right[:rank] @ frame.T).reshape(rank, *rows.shape[1:]).astype(np.float32)
     return basis, left[:, :rank] * values[:rank]
 
 

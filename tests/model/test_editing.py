@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,7 +79,7 @@ def test_kept_vertices_return_to_a_micrometre(toy: Checkpoint, basis_seed: int) 
     np.testing.assert_allclose(flat @ flat.T, np.eye(len(flat)), atol=1e-5)
 
 
-def test_an_edited_file_can_be_edited_again(toy: Checkpoint, tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_an_edited_file_can_be_edited_again(toy: Checkpoint, tmp_path: Path) -> None:
     share = np.zeros(talker.D, np.float32)
     share[:7] = 1
     once = edit(toy, features(), Kept(motion_of(toy), spans(), share), steps=FAST)[0]
