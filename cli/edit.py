@@ -36,7 +36,7 @@ def edit(
     ] = "",
     blend_mm: Annotated[
         float, typer.Option(min=0, help="Width of the border around the named parts.")
-    ] = 10.0,
+    ] = 20.0,
     unconditional: Annotated[
         bool, typer.Option("--unconditional", help="Do not listen to the audio, only play it.")
     ] = False,

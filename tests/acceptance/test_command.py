@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from personalize.subject_data import BASE_CHECKPOINT
+
 
 def personalize(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "cli.main", *map(str, arguments)]
@@ -26,7 +28,7 @@ def test_version_and_help(tmp_path: Path) -> None:
     assert personalize("--version", cwd=tmp_path).stdout.startswith("personalize 0.")
     shown = personalize("--help", cwd=tmp_path)
     assert shown.returncode == 0
-    assert "animate" in shown.stdout and "demo" in shown.stdout
+    assert all(command in shown.stdout for command in ("animate", "edit", "demo"))
     assert "--iterations" in personalize("run", "--help", cwd=tmp_path).stdout
 
 
@@ -51,3 +53,6 @@ def test_what_is_no_video_is_refused_and_leaves_nothing(
 def test_wrong_options_get_one_line(tmp_path: Path) -> None:
     assert_refused(personalize("run", "talk.mp4", "--iterations", "none", cwd=tmp_path), "iterations")
     assert_refused(personalize("animate", "speech.wav", "--subject", "nowhere", cwd=tmp_path), "nowhere")
+    edit = ("edit", "none.npz", "--subject", str(BASE_CHECKPOINT))
+    assert_refused(personalize(*edit, cwd=tmp_path), "none.npz", "motion.npz")
+    assert_refused(personalize(*edit, "--rule", "euler", cwd=tmp_path), "rule")

@@ -63,9 +63,8 @@ def run(motion: Path, audio: Path | None, out: Path, **settings: object) -> list
 def test_frames_and_regions_are_kept_and_films_have_sound(
     base: Checkpoint, motion: Path, speech: Path, tmp_path: Path
 ) -> None:
-    paths = run(
-        *(motion, speech, tmp_path / "out"), keep=":0.7,1.8:", keep_regions=("eyelids",), samples=2, seed=3
-    )
+    kept = {"keep": ":0.7,1.8:", "keep_regions": ("eyelids",)}
+    paths = run(motion, speech, tmp_path / "out", samples=2, seed=3, **kept)
     names = [path.relative_to(tmp_path / "out").as_posix() for path in paths]
     assert names == ["0/motion.npz", "0/animation.mp4", "1/motion.npz", "1/animation.mp4"]
     truth = Motion.load(motion).displacements()

@@ -1,5 +1,7 @@
 """Parts of the face by name, as shares of vertices."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -26,8 +28,6 @@ def test_what_is_named_is_kept_or_made_anew_wholly(base: Checkpoint) -> None:
 
 def test_the_border_falls_along_the_surface(base: Checkpoint) -> None:
     """On a strip of points 1 mm apart the share falls by a tenth a point; what is not connected stays free."""
-    from dataclasses import replace
-
     strip = np.array([[0.001 * i, 0, 0] for i in range(30)] + [[0, 1e-4, 0]] * 3, np.float32)
     faces = np.array([[i, i + 1, i] for i in range(29)] + [[30, 31, 32]], np.int32)
     toy = replace(base, template=strip, faces=faces, regions={"end": np.array([0, 1], np.int32)})
