@@ -55,6 +55,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--precision", choices=("float32", "bfloat16"), default=TrainingConfig.precision)
+    parser.add_argument("--device", default=TrainingConfig.device)
     arguments = parser.parse_args()
     sequence = random_sequence(0)
     checkpoint = untrained(sequence)
@@ -63,7 +65,13 @@ def main() -> None:
     print(f"{'threads':>7} {'ms/step':>8} {'CPU ms':>8} {f'min for {ITERATIONS:,}':>15} {'peak MB':>8}")
     for threads in arguments.threads:
         with tempfile.TemporaryDirectory() as folder:
-            config = TrainingConfig(iterations=arguments.steps, candidates=1, threads=threads)
+            config = TrainingConfig(
+                iterations=arguments.steps,
+                candidates=1,
+                threads=threads,
+                precision=arguments.precision,
+                device=arguments.device,
+            )
             trainer = Trainer(checkpoint, [sequence], Path(folder), config)
             wall, cpu = time.perf_counter(), time.process_time()
             trainer.train()

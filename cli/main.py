@@ -18,12 +18,19 @@ import typer
 
 from cli.animate import animate
 from cli.demo import demo
+from cli.edit import edit
 from cli.run import run
 from cli.train import train
 from personalize.errors import UserError
 from personalize.run import tool_version
 
-COMMANDS: dict[str, Callable[..., None]] = {"run": run, "animate": animate, "demo": demo, "train": train}
+COMMANDS: dict[str, Callable[..., None]] = {
+    "run": run,
+    "animate": animate,
+    "edit": edit,
+    "train": train,
+    "demo": demo,
+}
 INPUT_ERROR, BUG, INTERRUPTED = 2, 1, 130
 
 app = typer.Typer(
@@ -31,6 +38,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     help="Turn a talking-head video into a personal, editable 3D facial animation model.",
     epilog="""Examples:  personalize talk.mp4   |   personalize animate speech.wav --subject talk.personalize   |
+    personalize edit talk.animation/motion.npz --audio speech.wav --keep :1.5,8.2: --subject talk.personalize   |
     personalize demo.   A video whose name is a command's is given as ./name.""",
 )
 for name, command in COMMANDS.items():

@@ -131,7 +131,8 @@ class Diffusion:
     ) -> Tensor:
         """Run the whole reverse chain from unit noise of `shape` [N, *b, K].
 
-        overwrite: applied to every x0hat, e.g. to put known values back into the frames to keep (METHOD 5).
+        overwrite: applied to every x0hat that a step goes on from, e.g. to put known values back into the frames
+        to keep (METHOD 5). The last x0hat is the result as predicted: the caller puts known values back exactly.
         Raises ModelError for an unknown rule or an impossible number of steps.
         """
         if rule not in RULES:
@@ -140,9 +141,9 @@ class Diffusion:
         x = torch.randn(shape, generator=generator)
         for index, t in enumerate(times):
             x0 = predict(x, t)
-            if overwrite is not None:
-                x0 = overwrite(x0)
             s = times[index + 1] if index + 1 < len(times) else -1
+            if overwrite is not None and s >= 0:
+                x0 = overwrite(x0)
             x = self.reverse(x, x0, t, s, rule, generator)
             if progress is not None:
                 progress(index + 1, len(times))

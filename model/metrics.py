@@ -163,6 +163,40 @@ def velocity(sample: F32, reference: F32, shot: NDArray[np.integer]) -> float:
     return _ratio(*sizes)
 
 
+def seam(sample: F32, kept: NDArray[np.bool_], reference: F32, shot: NDArray[np.integer]) -> float:
+    """How much an edit jerks where kept and new frames meet: 1 is as sharp as the person ever moves. 0 without a seam.
+
+    The jump of velocity at frame n is |x[n+1] - 2 x[n] + x[n-1]|. A seam lies between two frames of which one is in
+    `kept` [N] bool, and has the larger of the jumps at these two. The mean over seams is divided by the 99th percentile
+    of the reference's jumps within its shots. sample [N, ...], reference [M, ...] in the same unit, shot [M] int.
+    Infinite where the sample jumps and the reference never does.
+    """
+    jumps = np.pad(_velocity_jumps(sample), 1)
+    seams = np.flatnonzero(kept[1:] != kept[:-1])
+    if len(seams) == 0:
+        return 0.0
+    size = float(np.maximum(jumps[seams], jumps[seams + 1]).mean())
+    own = _velocity_jumps(reference)[shot[2:] == shot[:-2]]
+    usual = float(np.percentile(own, 99)) if len(own) else 0.0
+    return size / usual if usual > 0 else (math.inf if size > 0 else 0.0)
+
+
+def _velocity_jumps(motion: F32) -> NDArray[np.float64]:
+    """[N, ...] -> [max(N - 2, 0)]: norm of the second difference about each inner frame."""
+    second = np.diff(motion.reshape(len(motion), -1).astype(np.float64), n=2, axis=0)
+    jumps: NDArray[np.float64] = np.linalg.norm(second, axis=1)
+    return jumps
+
+
+def isometry(basis: F32, vertices: NDArray[np.integer]) -> F32:
+    """basis [K, D, 3] -> [K, <= K]: coefficients through it are the stacked vertices in an orthonormal frame of theirs.
+
+    With B = Q R over these vertices the distance of two frames is |B (a - b)| = |R (a - b)|: exact, without them.
+    """
+    frame: F32 = np.linalg.qr(basis[:, vertices].reshape(len(basis), -1).T)[1].T
+    return frame
+
+
 def _score_sample(
     sample: F32,
     reference: F32,
@@ -198,17 +232,14 @@ class _Region:
         index = _vertices(checkpoint.regions, name)
         self._template = checkpoint.template[index]
         self._basis = checkpoint.basis[:, index]
-        self._isometry = np.linalg.qr(self._basis.reshape(len(self._basis), -1).T)[1].T
+        self._isometry = isometry(checkpoint.basis, index)
 
     def vertices_mm(self, coefficients: F32) -> F32:
         """[N, K] m -> positions [N, V, 3] mm."""
         return 1000 * (self._template + np.tensordot(coefficients, self._basis, axes=1))
 
     def stacked_mm(self, coefficients: F32) -> F32:
-        """[..., K] m -> [..., <= K] mm: the stacked vertices in an orthonormal frame of the region's own motion.
-
-        With B = Q R the distance of two frames is |B (a - b)| = |R (a - b)|: exact, and V never appears.
-        """
+        """[..., K] m -> [..., <= K] mm: the stacked vertices in an orthonormal frame of the region's own motion."""
         return 1000 * (coefficients @ self._isometry)
 
 

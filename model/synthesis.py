@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from model.checkpoint import Checkpoint
+from model.dataset import Standardization
 from model.denoiser import MIN_FRAMES, Condition, Denoiser
 from model.diffusion import Diffusion, Overwrite, Progress, Rule
 from model.errors import ModelError
+from model.vertex_mask import VertexMask
 
 # Frames x samples of one evaluation: small enough for the processor's cache, large enough for its matrix
 # products.
@@ -23,10 +25,33 @@ CHUNK_ROWS = 1024
 
 @dataclass(frozen=True)
 class Keep:
-    """Frames to keep: coefficients [N, K] m, and which of them are known, [N] or [N, K] bool."""
+    """What to keep: coefficients [N, K] m, and which of them are known, [N] or [N, K] bool.
+
+    vertices: parts of the face to keep in other frames. What single vertices look like in the end is outside the
+    basis: `model.editing.edit` puts them back, `synthesize` returns the coefficients of the free ones.
+    """
 
     coefficients: NDArray[np.float32]
     mask: NDArray[np.bool_]
+    vertices: VertexMask | None = None
+
+    @property
+    def where(self) -> NDArray[np.bool_]:
+        """The mask, [N, 1] or [N, K]."""
+        return self.mask if self.mask.ndim == 2 else self.mask[:, None]
+
+    def overwrite(self, standardization: Standardization) -> Overwrite:
+        """Puts the known values into a standardized x0hat [>= N, S, K], leaving a padded tail alone."""
+        mask = torch.from_numpy(self.where)[:, None]
+        known = standardization.motion(np.nan_to_num(self.coefficients))[:, None]
+        keep_vertices = None if self.vertices is None else self.vertices.overwrite(standardization)
+
+        def overwrite(x0: Tensor) -> Tensor:
+            x0 = x0.clone() if keep_vertices is None else keep_vertices(x0)
+            x0[: len(mask)] = torch.where(mask, known, x0[: len(mask)])
+            return x0
+
+        return overwrite
 
 
 class Guided:
@@ -64,20 +89,6 @@ class Guided:
         return unconditional + self._guidance * (conditional - unconditional)
 
 
-def _overwrite(keep: Keep, known: Tensor) -> Overwrite:
-    """Puts the known values (standardized, [N, K]) back into the frames to keep, leaving a padded tail
-    alone.
-    """
-    mask = torch.from_numpy(keep.mask if keep.mask.ndim == 2 else keep.mask[:, None])[:, None]
-
-    def overwrite(x0: Tensor) -> Tensor:
-        x0 = x0.clone()
-        x0[: len(mask)] = torch.where(mask, known[:, None], x0[: len(mask)])
-        return x0
-
-    return overwrite
-
-
 @torch.inference_mode()
 def synthesize(
     checkpoint: Checkpoint,
@@ -96,6 +107,7 @@ def synthesize(
 
     style: a name of the checkpoint's styles; None for the subject. guidance: s; None for the checkpoint's
     own.
+    keep: known values, put into every step's x0hat (METHOD 5) and returned exactly.
     The same arguments give the same bytes. Raises ModelError for features of another width, an unknown
     style or rule.
     """
@@ -123,7 +135,7 @@ def synthesize(
     if keep is not None:
         if keep.coefficients.shape != (length, checkpoint.config.coefficients):
             raise ModelError(f"kept motion of shape {keep.coefficients.shape} for {length} frames of speech")
-        overwrite = _overwrite(keep, checkpoint.standardization.motion(np.nan_to_num(keep.coefficients)))
+        overwrite = keep.overwrite(checkpoint.standardization)
     x = diffusion.sample(
         predict,
         (padded, samples, checkpoint.config.coefficients),
@@ -133,4 +145,8 @@ def synthesize(
         overwrite,
         progress,
     )
-    return np.ascontiguousarray(checkpoint.standardization.metres(x[:length]).transpose(1, 0, 2))
+    drawn = checkpoint.standardization.metres(x[:length]).transpose(1, 0, 2)
+    if keep is not None:
+        # In metres: the way through the standardization and back would round.
+        drawn = np.where(keep.where, keep.coefficients, drawn)
+    return np.ascontiguousarray(drawn, np.float32)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from model.checkpoint import Checkpoint
 from model.errors import ModelError
 from model.motion import FPS, Motion
-from model.speech import load_encoder
+from model.speech import SpeechEncoder, load_encoder
 from model.synthesis import synthesize
 from personalize.errors import UserError
 from personalize.files import sha256_file
@@ -20,6 +20,8 @@ from personalize.render.face import FaceCamera
 from personalize.reporter import Reporter
 from personalize.run import tool_version
 from personalize.subject_data import speech_features
+
+F32 = NDArray[np.float32]
 
 FILM_SIZE = (720, 720)
 AUDIO_RATE = 48_000
@@ -38,36 +40,22 @@ def animate_speech(
     """Write `motion.npz` and `animation.mp4` of each sample; yields their paths.
 
     subject: a run folder or a checkpoint file. With several samples each lies in a folder of its own, `0`, `1`, …
-    encoder: folder or hub name of the speech encoder that the checkpoint needs; None for the embedded one.
-    Raises UserError for sound or checkpoint that cannot be used, and for an output that cannot be written.
+    Time 0 of the motion is time 0 of a sound file, the first picture of a video file. encoder: folder or hub name of
+    the speech encoder that the checkpoint needs; None for the embedded one. Raises UserError for sound or checkpoint
+    that cannot be used, and for an output that cannot be written.
     """
-    path = subject / "checkpoint.safetensors" if subject.is_dir() else subject
-    if not path.is_file():
-        raise UserError(
-            f"{subject}: no checkpoint there; give a finished run folder or a checkpoint.safetensors"
-        )
-    try:
-        speech_encoder = load_encoder(encoder)
-        checkpoint = Checkpoint.load(path, encoder=speech_encoder.name)
-    except ModelError as error:
-        raise UserError(str(error)) from error
-    sound, _ = read_audio(speech, AUDIO_RATE)
-    if not np.any(np.abs(sound) > 1e-4):
-        raise UserError(f"{speech}: there is no sound in it; give a recording of speech")
-    seconds = len(sound) / AUDIO_RATE
-    features = speech_features(speech, np.arange(max(1, round(seconds * FPS))) / FPS, speech_encoder)
+    path, checkpoint, speech_encoder = load_subject(subject, encoder)
+    sound, start_s = read_speech(speech)
+    frames = max(1, round((start_s + len(sound) / AUDIO_RATE) * FPS))
+    features = speech_features(speech, np.arange(frames) / FPS, speech_encoder)
     s = checkpoint.guidance if guidance is None else guidance
     with report.stage("synthesis"):
         motions = synthesize(
             checkpoint, features, guidance=s, samples=samples, seed=seed, progress=report.progress
         )
+    audio = on_video_clock(sound, start_s, frames / FPS, AUDIO_RATE)
     folder = out or Path(f"{speech.stem}.animation")
     for index, coefficients in enumerate(motions):
-        place = folder if samples == 1 else folder / str(index)
-        try:
-            place.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UserError(f"{place}: cannot be written ({error.strerror}); choose another --out") from None
         motion = Motion(
             fps=FPS,
             start_s=0.0,
@@ -87,20 +75,62 @@ def animate_speech(
                 "guidance": s,
             },
         )
-        motion.save(place / "motion.npz")
-        yield place / "motion.npz"
-        with report.stage("film"):
-            write_film(place / "animation.mp4", motion, checkpoint.regions["face"], sound, report)
-        yield place / "animation.mp4"
+        place = sample_folder(folder, index, samples)
+        yield from write_sample(place, motion, checkpoint.regions["face"], audio, report)
+
+
+def load_subject(subject: Path, encoder: str | None) -> tuple[Path, Checkpoint, SpeechEncoder]:
+    """A run folder or a checkpoint file -> where the checkpoint lies, itself, and the speech encoder that it needs.
+
+    Raises UserError for another thing, or where `encoder` (None: the embedded one) is not the one it needs.
+    """
+    path = subject / "checkpoint.safetensors" if subject.is_dir() else subject
+    if not path.is_file():
+        raise UserError(
+            f"{subject}: no checkpoint there; give a finished run folder or a checkpoint.safetensors"
+        )
+    try:
+        speech_encoder = load_encoder(encoder)
+        return path, Checkpoint.load(path, encoder=speech_encoder.name), speech_encoder
+    except ModelError as error:
+        raise UserError(str(error)) from error
+
+
+def read_speech(speech: Path) -> tuple[F32, float]:
+    """Sound [S] at 48 kHz and the time s of its first sample; UserError where there is nothing to hear."""
+    sound, start_s = read_audio(speech, AUDIO_RATE)
+    if not np.any(np.abs(sound) > 1e-4):
+        raise UserError(f"{speech}: there is no sound in it; give a recording of speech")
+    return sound, start_s
+
+
+def sample_folder(folder: Path, index: int, samples: int) -> Path:
+    """The folder of one of several samples, made if need be; UserError where it cannot be."""
+    place = folder if samples == 1 else folder / str(index)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{place}: cannot be written ({error.strerror}); choose another --out") from None
+    return place
+
+
+def write_sample(
+    place: Path, motion: Motion, face: NDArray[np.integer], sound: F32 | None, report: Reporter
+) -> Iterator[Path]:
+    """`motion.npz` and `animation.mp4` in the folder `place`; yields their paths. Sound as for `write_film`."""
+    motion.save(place / "motion.npz")
+    yield place / "motion.npz"
+    with report.stage("film"):
+        write_film(place / "animation.mp4", motion, face, sound, report)
+    yield place / "animation.mp4"
 
 
 def write_film(
-    path: Path, motion: Motion, face: NDArray[np.integer], sound: NDArray[np.float32], report: Reporter
+    path: Path, motion: Motion, face: NDArray[np.integer], sound: F32 | None, report: Reporter
 ) -> None:
-    """The motion from the front, 30 fps, with its sound [S] at 48 kHz from the motion's first frame on."""
+    """The motion from the front, 30 fps, with its sound [S] at 48 kHz from the motion's first frame on, if any."""
     camera = FaceCamera(motion.template, motion.faces, face, FILM_SIZE)
-    audio = on_video_clock(sound, 0.0, len(motion.valid) / motion.fps, AUDIO_RATE)
-    with VideoWriter(path, motion.fps, FILM_SIZE, audio, AUDIO_RATE) as film:
+    with VideoWriter(path, motion.fps, FILM_SIZE, sound, AUDIO_RATE) as film:
         for frame in range(len(motion.valid)):
             displacement = np.tensordot(motion.coefficients[frame], motion.basis, axes=1)
             film.write(camera.picture(displacement))

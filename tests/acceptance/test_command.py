@@ -29,7 +29,7 @@ def test_version_and_help(tmp_path: Path) -> None:
     assert personalize("--version", cwd=tmp_path).stdout.startswith("personalize 0.")
     shown = personalize("--help", cwd=tmp_path)
     assert shown.returncode == 0
-    assert "animate" in shown.stdout and "demo" in shown.stdout
+    assert all(command in shown.stdout for command in ("animate", "edit", "demo"))
     assert "--iterations" in personalize("run", "--help", cwd=tmp_path).stdout
 
 
@@ -57,6 +57,9 @@ def test_wrong_options_get_one_line(tmp_path: Path) -> None:
     assert_refused(personalize("train", "--out", "base.safetensors", cwd=tmp_path), "--vocaset", "--motions")
     data = ("--vocaset", "nowhere", "--template-mesh", "m.ply")
     assert_refused(personalize("train", "--out", "base.safetensors", *data, cwd=tmp_path), "nowhere")
+    edit = ("edit", "none.npz", "--subject", str(BASE_CHECKPOINT))
+    assert_refused(personalize(*edit, cwd=tmp_path), "none.npz", "motion.npz")
+    assert_refused(personalize(*edit, "--rule", "euler", cwd=tmp_path), "rule")
 
 
 def test_an_encoder_that_is_not_there_gets_one_line_before_any_work(tmp_path: Path) -> None:

@@ -106,6 +106,22 @@ def test_spread_and_velocity_by_hand() -> None:
     assert metrics.spread(reference, 0 * reference) == 1.0
 
 
+def test_seam_by_hand() -> None:
+    """Positions 0 0 0 3 3 3: velocity jumps by 3 before and after; the reference's jumps are 1, but across a cut."""
+    sample = np.array([0, 0, 0, 3, 3, 3], np.float32)
+    reference = np.array([0, 0, 1, 2, 50, 50, 50], np.float32)
+    shot = np.array([0, 0, 0, 0, 1, 1, 1])
+    # Within shots: |1 - 0 - 0 + 0| = 1, then 0, and 0 after the cut; the 99th percentile of (1, 0, 0) is .98.
+    kept = np.array([1, 1, 1, 0, 0, 0], bool)
+    assert metrics.seam(sample, kept, reference, shot) == pytest.approx(3 / 0.98)
+    # A keyframe at 4: the seam 3|4 sees the jump at 3, the seam 4|5 sees that at 4, which is none.
+    keyframe = np.array([0, 0, 0, 0, 1, 0], bool)
+    assert metrics.seam(sample, keyframe, reference, shot) == pytest.approx(1.5 / 0.98)
+    assert metrics.seam(sample, ~kept & kept, reference, shot) == 0.0
+    assert metrics.seam(sample, kept, 0 * reference, shot) == math.inf
+    assert metrics.seam(sample[:1], kept[:1], reference, shot) == 0.0
+
+
 def test_opening_is_negative_where_lips_overlap() -> None:
     mesh = talker.checkpoint([talker.sequence(40, 0)])
     template = mesh.template.copy()

@@ -1,0 +1,194 @@
+"""Edits of a motion file: which frames and parts of the face are kept, where its sound lies, and what is written."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.checkpoint import Checkpoint
+from model.diffusion import Rule
+from model.editing import Kept, edit, seam_of, with_frames
+from model.errors import ModelError
+from model.motion import Motion, MotionError
+from model.speech import SpeechEncoder
+from personalize.animation import AUDIO_RATE, load_subject, read_speech, sample_folder, write_sample
+from personalize.errors import UserError
+from personalize.files import sha256_file
+from personalize.media import on_video_clock
+from personalize.regions import kept_share
+from personalize.reporter import Reporter
+from personalize.run import tool_version
+from personalize.subject_data import speech_features
+from personalize.times import frames_at
+
+F32 = NDArray[np.float32]
+
+# Sound and pictures of one recording may end this far apart.
+SOUND_SLACK_S = 0.1
+
+
+@dataclass(frozen=True)
+class EditSettings:
+    """What is kept, as a user says it, and how the rest is drawn.
+
+    keep, keyframes: times as for `frames_at`; keyframes come from the motion file `source` where one is given.
+    keep_regions, remake: names of parts of the face, one of the two. blend_mm: width of the border between parts.
+    unconditional: the sound is not listened to, only played. guidance: None for the checkpoint's own.
+    encoder: folder or hub name of the speech encoder that the checkpoint needs; None for the embedded one.
+    """
+
+    keep: str = ""
+    keyframes: str = ""
+    source: Path | None = None
+    keep_regions: tuple[str, ...] = ()
+    remake: tuple[str, ...] = ()
+    blend_mm: float = 20.0
+    unconditional: bool = False
+    samples: int = 1
+    guidance: float | None = None
+    seed: int = 0
+    rule: Rule = "posterior"
+    encoder: str | None = None
+
+
+def edit_motion(
+    path: Path, subject: Path, speech: Path | None, out: Path | None, settings: EditSettings, report: Reporter
+) -> Iterator[Path]:
+    """Write `motion.npz` and `animation.mp4` of each sample, as `animate_speech` does; yields their paths.
+
+    path: a motion file; the results have its frames, clock and template. speech: time 0 is presentation time 0 (of a
+    video file, its first picture), None for an unconditional edit without sound. Raises UserError for input that cannot
+    be used.
+    """
+    checkpoint_path, checkpoint, encoder = load_subject(subject, settings.encoder)
+    motion = _load_motion(path)
+    folder = out or Path(f"{path.stem}.edit")
+    if (folder / "motion.npz").resolve() == path.resolve():
+        raise UserError(f"{folder}: holds the motion that is edited; choose another --out")
+    offset_s = _sound_offset(path, motion)
+    sound, features = (None, None) if speech is None else _sound_of(speech, motion, offset_s, encoder)
+    guidance = _guidance(settings, checkpoint, heard=features is not None)
+    try:
+        kept = _kept(motion, checkpoint, settings)
+        with report.stage("synthesis"):
+            edited = edit(
+                checkpoint,
+                None if settings.unconditional else features,
+                kept,
+                guidance=guidance,
+                samples=settings.samples,
+                seed=settings.seed,
+                rule=settings.rule,
+                progress=report.progress,
+            )
+    except ModelError as error:
+        raise UserError(f"{path}: {error}") from error
+    facts = {
+        "tool": "personalize",
+        "version": tool_version(),
+        "synthetic": True,
+        "source": None if speech is None else speech.name,
+        "checkpoint": sha256_file(checkpoint_path),
+        "seed": settings.seed,
+        "guidance": guidance,
+        "rule": settings.rule,
+        "av_offset_s": offset_s,
+        "edit": _as_json(path, kept, settings),
+    }
+    face = checkpoint.regions["face"]
+    for index, result in enumerate(edited):
+        seam = seam_of(result, kept.frames, motion, face)
+        report.say(f"sample {index}: {kept.frames.sum()} of {len(kept.frames)} frames kept, seam {seam:.2f}")
+        place = sample_folder(folder, index, settings.samples)
+        result = dataclasses.replace(result, provenance=facts | {"sample": index})
+        yield from write_sample(place, result, face, sound, report)
+
+
+def _guidance(settings: EditSettings, checkpoint: Checkpoint, heard: bool) -> float:
+    """The s that is used; UserError where one is asked for and there is nothing to be guided by."""
+    if heard and not settings.unconditional:
+        return checkpoint.guidance if settings.guidance is None else settings.guidance
+    if settings.guidance is not None:
+        raise UserError("--guidance: needs --audio, and no --unconditional; leave it out")
+    return 0.0
+
+
+def _load_motion(path: Path) -> Motion:
+    try:
+        return Motion.load(path)
+    except MotionError as error:
+        raise UserError(f"{error}; give the motion.npz of a run or of an animation") from error
+
+
+def _kept(motion: Motion, checkpoint: Checkpoint, settings: EditSettings) -> Kept:
+    """What the settings keep. Frames of spans in which no face was seen are made anew."""
+    frames = frames_at(settings.keep, motion, "--keep")
+    keyframes = frames_at(settings.keyframes, motion, "--keyframes")
+    if settings.source is not None:
+        if not keyframes.any():
+            raise UserError("--from: say with --keyframes which times are taken from it")
+        motion = _with_keyframes(motion, settings.source, keyframes)
+    unseen = np.flatnonzero(keyframes & ~motion.valid)
+    if len(unseen):
+        time = motion.start_s + unseen[0] / motion.fps
+        raise UserError(f"--keyframes: no face was seen at {time:.2f} s; choose another time")
+    share = kept_share(checkpoint, settings.keep_regions, settings.remake, settings.blend_mm / 1000)
+    return Kept(motion, (frames | keyframes) & motion.valid, share)
+
+
+def _with_keyframes(motion: Motion, source: Path, keyframes: NDArray[np.bool_]) -> Motion:
+    """The motion with some frames from another file: of the same presentation time, to the nearest frame."""
+    other = _load_motion(source)
+    times = motion.start_s + np.flatnonzero(keyframes) / motion.fps
+    places = np.floor((times - other.start_s) * other.fps + 0.5).astype(int)
+    outside = (places < 0) | (places >= len(other.valid))
+    if outside.any():
+        end_s = other.start_s + len(other.valid) / other.fps
+        raise UserError(
+            f"--keyframes: {times[outside][0]:.2f} s is outside {source}, which is from {other.start_s:.2f} to"
+            f" {end_s:.2f} s"
+        )
+    return with_frames(motion, other, keyframes, places)
+
+
+def _sound_offset(path: Path, motion: Motion) -> float:
+    """How late the sound is, s, where the motion is of a run whose sound did not fit its pictures, or made from one."""
+    registration = path.with_name("registration.json")
+    if motion.provenance.get("synthetic") is False and registration.is_file():
+        return float(json.loads(registration.read_text(encoding="utf-8"))["av_offset_s"])
+    return float(motion.provenance.get("av_offset_s", 0.0))
+
+
+def _sound_of(speech: Path, motion: Motion, offset_s: float, encoder: SpeechEncoder) -> tuple[F32, F32]:
+    """Sound [S] at 48 kHz from the motion's first frame on, and the speech features [N, W] of its frames."""
+    sound, start_s = read_speech(speech)
+    times = motion.start_s + offset_s + np.arange(len(motion.valid)) / motion.fps
+    end_s = start_s + len(sound) / AUDIO_RATE
+    if end_s < times[-1] - SOUND_SLACK_S:
+        raise UserError(
+            f"{speech}: its sound ends at {end_s:.2f} s, the motion at {times[-1]:.2f} s; give the whole recording"
+        )
+    length_s = len(times) / motion.fps
+    features = speech_features(speech, times, encoder)
+    return on_video_clock(sound, start_s - times[0], length_s, AUDIO_RATE), features
+
+
+def _as_json(path: Path, kept: Kept, settings: EditSettings) -> dict[str, object]:
+    """What was kept, for the provenance."""
+    return {
+        "motion": path.name,
+        "motion_sha256": sha256_file(path),
+        "keep": settings.keep,
+        "keyframes": settings.keyframes,
+        "from_sha256": None if settings.source is None else sha256_file(settings.source),
+        "keep_regions": list(settings.keep_regions),
+        "remake": list(settings.remake),
+        "blend_mm": settings.blend_mm,
+        "kept_frames": int(kept.frames.sum()),
+    }
