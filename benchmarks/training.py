@@ -55,7 +55,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--precision", choices=("float32", "bfloat16"), default=TrainingConfig.precision)
+    parser.add_argument(
+        "--precision", choices=("auto", "float32", "bfloat16"), default=TrainingConfig.precision
+    )
     parser.add_argument("--device", default=TrainingConfig.device)
     arguments = parser.parse_args()
     sequence = random_sequence(0)

@@ -167,7 +167,7 @@ class Registration(Stage):
 class Finetune(Stage):
     """Motion + speech -> the subject's checkpoint."""
 
-    name, version, reads, resumes = "finetune", 2, ("iterations", "seed"), True
+    name, version, reads, resumes = "finetune", 3, ("iterations", "seed"), True
     needs = (
         "ingest/audio.wav",
         "ingest/split.json",

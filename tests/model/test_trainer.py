@@ -15,10 +15,12 @@ from model.dataset import Crops
 from model.errors import ModelError
 from model.metrics import score
 from model.synthesis import synthesize
-from model.trainer import LOG_FILE, STATE_FILE, Draws, Trainer, TrainingConfig, TrainingDivergedError
+from model.trainer import LOG_FILE, STATE_FILE, Draws, Trainer, TrainingConfig, TrainingDivergedError, settled
 from tests.model import talker
 
-TINY = TrainingConfig(iterations=24, batch=4, frames=12, candidates=3, log_every=5, threads=1)
+TINY = TrainingConfig(
+    iterations=24, batch=4, frames=12, candidates=3, log_every=5, threads=1, precision="float32"
+)
 
 
 def start() -> tuple[Checkpoint, list]:
@@ -197,6 +199,14 @@ def test_weight_decay_shrinks_what_the_data_do_not_ask_for(tmp_path: Path) -> No
         path = Trainer(*start(), tmp_path / str(decay), config).train()[-1]
         norms.append(float(Checkpoint.load(path).network["middle.weight"].norm()))
     assert norms[1] < 0.8 * norms[0]
+
+
+def test_what_the_machine_decides_is_settled_once() -> None:
+    config = settled(TrainingConfig())
+    assert config.precision in ("float32", "bfloat16") and config.threads in (1, 2)
+    assert settled(config) == config
+    assert settled(TrainingConfig(precision="float32")).threads == 2
+    assert settled(TrainingConfig(precision="bfloat16", threads=4)).threads == 4
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
