@@ -26,6 +26,7 @@ def run(
         str | None,
         typer.Option(help="Folder or hub name of the speech encoder that --base was trained with."),
     ] = None,
+    device: Annotated[str, typer.Option(help="That fine-tuning runs on: cpu or cuda.")] = Settings.device,
     until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
     from_: Annotated[
         str | None, typer.Option("--from", metavar="STAGE", help="Make again from here on.")
@@ -40,6 +41,7 @@ def run(
         iterations=iterations,
         seed=seed,
         focal_px=focal,
+        device=device,
         base=None if base is None else str(base),
         encoder=encoder,
     )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -37,6 +38,13 @@ def train(
     encoder: Annotated[
         str | None, typer.Option(help="Speech encoder: folder or hub name; the embedded one if not given.")
     ] = None,
+    architecture: Annotated[
+        Literal["conv", "attention", "transformer"],
+        typer.Option(help="The paper's network, or one of the two that it is compared with."),
+    ] = "conv",
+    device: Annotated[
+        str, typer.Option(help="cpu or cuda; `torchrun -m cli.main train …` trains on several.")
+    ] = "cpu",
     seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
@@ -51,14 +59,16 @@ def train(
         )
 
     from personalize.reporter import Reporter
-    from personalize.training import train_on_motions, train_on_vocaset
+    from personalize.training import TrainSettings, train_on_motions, train_on_vocaset
+
+    settings = TrainSettings(iterations, seed, encoder, architecture, device)
 
     if vocaset is not None and template_mesh is not None:
-        result = train_on_vocaset(
-            vocaset, template_mesh, out, iterations, adapt or [], seed, encoder, Reporter()
-        )
+        result = train_on_vocaset(vocaset, template_mesh, out, adapt or [], settings, Reporter())
     elif motions is not None:
-        result = train_on_motions(motions, out, iterations, seed, encoder, Reporter())
+        result = train_on_motions(motions, out, settings, Reporter())
+    if os.environ.get("RANK", "0") != "0":
+        return  # of several processes the first speaks
     if json_:
         typer.echo(json.dumps(result))
     else:

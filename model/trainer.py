@@ -68,7 +68,8 @@ def settled(config: TrainingConfig) -> TrainingConfig:
     """The settings with this machine's answer where they leave it open: precision, then threads."""
     precision = config.precision
     if precision == "auto":
-        fast = torch.cuda.is_bf16_supported() if config.device != "cpu" else _multiplies_bfloat16()
+        cuda = _available(config.device).type == "cuda"
+        fast = torch.cuda.is_bf16_supported() if cuda else _multiplies_bfloat16()
         precision = "bfloat16" if fast else "float32"
     return replace(
         config, precision=precision, threads=config.threads or (1 if precision == "bfloat16" else 2)
@@ -78,6 +79,17 @@ def settled(config: TrainingConfig) -> TrainingConfig:
 def _multiplies_bfloat16() -> bool:
     """Whether the processor has tiles for it (AMX); elsewhere it is slower than float32."""
     return bool(torch.cpu.get_capabilities().get("amx_bf16"))
+
+
+def _available(name: str) -> torch.device:
+    """The device of that name. Raises ModelError where this machine has none."""
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise ModelError(f"device {name!r} is not known; use cpu or cuda") from None
+    if device.type not in ("cpu", "cuda") or (device.type == "cuda" and not torch.cuda.is_available()):
+        raise ModelError(f"device {name!r} is not there; use cpu")
+    return device
 
 
 class TrainingDivergedError(ModelError):
@@ -192,7 +204,7 @@ class Trainer:
         self._network = build_network(checkpoint.config)
         self._network.load_state_dict(checkpoint.network)
         self._objective: nn.Module = Objective(self._network, self._diffusion, weights, self.config)
-        self._objective.to(self.config.device)
+        self._objective.to(_available(self.config.device))
         self._rank, self._world = (0, 1)
         if distributed.is_initialized():
             self._rank, self._world = distributed.get_rank(), distributed.get_world_size()

@@ -44,7 +44,7 @@ def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
         subject,
         data.sequences("train"),
         work,
-        TrainingConfig(iterations=settings.iterations, seed=settings.seed),
+        TrainingConfig(iterations=settings.iterations, seed=settings.seed, device=settings.device),
         tensorboard=folder / "tensorboard",
     )
     candidates = trainer.train(report.progress)

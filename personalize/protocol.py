@@ -122,22 +122,21 @@ def compare_systems(
     train: Many[Sequence],
     subjects: Many[Subject],
     work: Path,
-    iterations: int,
-    seed: int,
+    config: TrainingConfig,
     report: Reporter,
 ) -> list[dict[str, Any]]:
     """The rows of SYSTEMS, means over the subjects: {"table", "system", "seconds", "paper", and each of METRICS}.
 
     base was trained on `train`; without adaptation a subject gets the mean of its styles. Adaptation takes 30 000
-    iterations, or `iterations` where that is less. seconds: what a subject really gave for it. A metric is the mean
+    iterations, or the base's own where these are less. seconds: what a subject really gave for it. A metric is the mean
     over 10 samples of each test sentence, weighted by frames; null where the adaptation diverged. Noise is on the
     audio of the test. Everything finished stays in `work`, and is not done again.
     """
-    steps = min(ADAPTATION_ITERATIONS, iterations)
+    config = replace(config, iterations=min(ADAPTATION_ITERATIONS, config.iterations))
     tables = []
     for subject in subjects:
         with report.stage(subject.name):
-            tables.append(_subject_table(base, train, subject, work / subject.name, steps, seed, report))
+            tables.append(_subject_table(base, train, subject, work / subject.name, config, report))
     rows = []
     for index, system in enumerate(SYSTEMS):
         parts = [table[index] for table in tables]
@@ -154,8 +153,7 @@ def _subject_table(
     train: Many[Sequence],
     subject: Subject,
     work: Path,
-    iterations: int,
-    seed: int,
+    config: TrainingConfig,
     report: Reporter,
 ) -> list[dict[str, float | None]]:
     """One subject's rows. Systems that come to the same (all seconds there are) are trained and judged once."""
@@ -169,11 +167,9 @@ def _subject_table(
         key = f"{frames} frames, s = {system.guidance}, noise {system.noise_db} dB"
         if key not in scores.known:
             if frames not in models:
-                models[frames] = _model(
-                    base, train, learned, subject, work / f"{frames}_frames", iterations, seed
-                )
+                models[frames] = _model(base, train, learned, subject, work / f"{frames}_frames", config)
             model = models[frames]
-            scores.add(key, _judge(model, subject, system, seed) if model else dict.fromkeys(METRICS))
+            scores.add(key, _judge(model, subject, system, config.seed) if model else dict.fromkeys(METRICS))
         rows.append(scores.known[key] | {"seconds": frames / FPS})
         report.progress(done + 1, len(SYSTEMS))
     return rows
@@ -199,8 +195,7 @@ def _model(
     learned: list[Sequence],
     subject: Subject,
     folder: Path,
-    iterations: int,
-    seed: int,
+    config: TrainingConfig,
 ) -> Checkpoint | None:
     """The base model adapted to what is learned of the subject, chosen on validation; None where training diverged.
 
@@ -208,13 +203,14 @@ def _model(
     """
     if not learned:
         return subject_of(base, "mean of styles", train, {})
-    start = subject_of(base, subject.name, learned, base.provenance | {"adapted_iterations": iterations})
-    config = TrainingConfig(iterations=iterations, seed=seed)
+    start = subject_of(
+        base, subject.name, learned, base.provenance | {"adapted_iterations": config.iterations}
+    )
     try:
         candidates = Trainer(start, learned, folder, config).train()
     except TrainingDivergedError:
         return None
-    best, _ = choose_checkpoint(candidates, subject.val, seed)
+    best, _ = choose_checkpoint(candidates, subject.val, config.seed)
     best = replace(best, template=subject.template)
     best.save(folder / "checkpoint.safetensors")
     return best

@@ -14,6 +14,7 @@ class Settings:
     focal_px: focal length in pixels, None to estimate it.
     base: checkpoint that fine-tuning starts from, None for the embedded one.
     encoder: folder or hub name of the speech encoder that `base` was trained with, None for the embedded one.
+    device: that fine-tuning runs on, `cpu` or `cuda`.
     """
 
     iterations: int = 30_000
@@ -21,3 +22,4 @@ class Settings:
     focal_px: float | None = None
     base: str | None = None
     encoder: str | None = None
+    device: str = "cpu"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from model.checkpoint import Checkpoint
 from model.dataset import Sequence, Standardization
+from model.denoiser import Architecture
 from model.errors import ModelError
 from model.finetuning import choose_checkpoint
 from model.motion import FPS, Motion, MotionError
 from model.motion_basis import MotionBasis, motion_basis
+from model.processes import joined
 from model.speech import SpeechEncoder, load_encoder
 from model.speech_windows import SpeechError
 from model.trainer import Trainer, TrainingConfig
@@ -35,25 +37,32 @@ F32 = NDArray[np.float32]
 CHUNK_FRAMES = 256  # of one motion, decoded together
 
 
+@dataclass(frozen=True)
+class TrainSettings:
+    """Options of `personalize train`.
+
+    encoder: folder or hub name of a speech encoder, None for the embedded one. device: `cpu` or `cuda`.
+    """
+
+    iterations: int = 140_000
+    seed: int = 0
+    encoder: str | None = None
+    architecture: Architecture = "conv"
+    device: str = "cpu"
+
+
 def train_on_vocaset(
-    folder: Path,
-    mesh: Path,
-    out: Path,
-    iterations: int,
-    adapt: list[str],
-    seed: int,
-    encoder: str | None,
-    report: Reporter,
+    folder: Path, mesh: Path, out: Path, adapt: list[str], settings: TrainSettings, report: Reporter
 ) -> dict[str, Any]:
     """Train on the training subjects and write `out`; then the paper's tables for the test subjects `adapt`.
 
-    adapt: [] for both. encoder: None for the embedded one, else a folder or hub name. mesh: a .ply or .obj of the
-    data's topology, for its faces. `<out>.work/` holds what a continuation needs.
+    adapt: [] for both. mesh: a .ply or .obj of the data's topology, for its faces. `<out>.work/` holds what a
+    continuation needs. Of several processes (`torchrun`) all train the base model, and the first does the rest.
 
     Returns {"checkpoint", "modes", "held", "systems"}; held: share of the squared displacement that the basis holds;
     systems: see `compare_systems`. Raises UserError, in one line, for whatever the user can mend.
     """
-    with _mendable(folder):
+    with _mendable(folder), joined(settings.device) as (rank, device):
         data = open_vocaset(folder)
         faces = read_faces(mesh, data.vertex_count)
         names, speakers = tested(data, adapt), there(data, TRAIN)
@@ -61,8 +70,10 @@ def train_on_vocaset(
         work = _work_folder(out)
         with report.stage("basis"):
             spoken = [(name, number) for name in speakers for number in data.sentences(name)]
-            motion = motion_basis(lambda: (data.displacements(*place) for place in spoken), seed=seed)
-        corpus = Corpus(data, motion, load_encoder(encoder))
+            motion = motion_basis(
+                lambda: (data.displacements(*place) for place in spoken), seed=settings.seed
+            )
+        corpus = Corpus(data, motion, load_encoder(settings.encoder))
         with report.stage("speech"):
             train, val = corpus.training(report.progress), corpus.validation()
         template = np.mean(list(data.templates.values()), axis=0).astype(np.float32)
@@ -75,28 +86,34 @@ def train_on_vocaset(
             faces=faces,
             standardization=Standardization.of(train),
             regions=mouth_regions(template, motion, data.masks),
-            seed=seed,
-            provenance=_provenance("VOCAset", iterations, seed),
+            seed=settings.seed,
+            architecture=settings.architecture,
+            provenance=_provenance("VOCAset", settings),
         )
-        base = _trained(untrained, train, val, work / "base", iterations, seed, report)
+        config = TrainingConfig(iterations=settings.iterations, seed=settings.seed, device=device)
+        base = _trained(untrained, train, val, work / "base", config, report)
+    result = {"checkpoint": str(out), "modes": len(motion.basis), "held": motion.held}
+    if rank > 0:
+        return result
+    with _mendable(folder):
         base.save(out)
         subjects = [corpus.subject(name, len(speakers)) for name in names]
-        systems = compare_systems(base, train, subjects, work, iterations, seed, report)
-    return {"checkpoint": str(out), "modes": len(motion.basis), "held": motion.held, "systems": systems}
+        systems = compare_systems(base, train, subjects, work, config, report)
+    return result | {"systems": systems}
 
 
-def train_on_motions(
-    folder: Path, out: Path, iterations: int, seed: int, encoder: str | None, report: Reporter
-) -> dict[str, Any]:
+def train_on_motions(folder: Path, out: Path, settings: TrainSettings, report: Reporter) -> dict[str, Any]:
     """Train on every `NAME.npz` (a Motion at 30 fps) of `folder` with its `NAME.wav`, one style each; write `out`.
 
     Returns {"checkpoint", "modes", "held"}. Raises UserError, in one line, for whatever the user can mend.
     """
-    with _mendable(folder):
-        motions, work, speech = _read_motions(folder), _work_folder(out), load_encoder(encoder)
+    with _mendable(folder), joined(settings.device) as (rank, device):
+        motions, work, speech = _read_motions(folder), _work_folder(out), load_encoder(settings.encoder)
         first = next(iter(motions.values()))
         with report.stage("basis"):
-            basis = motion_basis(lambda: (part for m in motions.values() for part in _decoded(m)), seed=seed)
+            basis = motion_basis(
+                lambda: (part for m in motions.values() for part in _decoded(m)), seed=settings.seed
+            )
         with report.stage("speech"):
             sequences = [
                 _motion_sequence(motion, basis, folder / f"{name}.wav", speech, style)
@@ -113,10 +130,14 @@ def train_on_motions(
             faces=first.faces,
             standardization=Standardization.of(sequences),
             regions=embedded.regions if same else mouth_regions(first.template, basis, {}),
-            seed=seed,
-            provenance=_provenance("tracked motions", iterations, seed),
+            seed=settings.seed,
+            architecture=settings.architecture,
+            provenance=_provenance("tracked motions", settings),
         )
-        _trained(untrained, sequences, [], work / "base", iterations, seed, report).save(out)
+        config = TrainingConfig(iterations=settings.iterations, seed=settings.seed, device=device)
+        base = _trained(untrained, sequences, [], work / "base", config, report)
+    if rank == 0:
+        base.save(out)
     return {"checkpoint": str(out), "modes": len(basis.basis), "held": basis.held}
 
 
@@ -145,21 +166,20 @@ def _trained(
     train: list[Sequence],
     val: list[Sequence],
     work: Path,
-    iterations: int,
-    seed: int,
+    config: TrainingConfig,
     report: Reporter,
 ) -> Checkpoint:
     """Train to the end; the checkpoint that is best on validation, or without validation the last.
 
     Nobody's style fits those who validate: all candidates speak in that of the last training subject.
     """
-    trainer = Trainer(untrained, train, work, TrainingConfig(iterations=iterations, seed=seed))
+    trainer = Trainer(untrained, train, work, config)
     with report.stage("training"):
         candidates = trainer.train(report.progress)
     if not val:
         return trainer.checkpoint()
     with report.stage("choice"):
-        return choose_checkpoint(candidates, val, seed)[0]
+        return choose_checkpoint(candidates, val, config.seed)[0]
 
 
 def _read_motions(folder: Path) -> dict[str, Motion]:
@@ -206,14 +226,14 @@ def _work_folder(out: Path) -> Path:
     return work
 
 
-def _provenance(source: str, iterations: int, seed: int) -> dict[str, Any]:
+def _provenance(source: str, settings: TrainSettings) -> dict[str, Any]:
     return {
         "tool": "personalize",
         "version": tool_version(),
         "synthetic": False,
         "source": source,
-        "iterations": iterations,
-        "seed": seed,
+        "iterations": settings.iterations,
+        "seed": settings.seed,
     }
 
 

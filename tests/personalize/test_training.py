@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from model.motion import Motion
 from model.motion_basis import motion_basis
 from model.speech import load_encoder
 from model.synthesis import synthesize
-from model.trainer import TrainingDivergedError
+from model.trainer import TrainingConfig, TrainingDivergedError
 from personalize import protocol
 from personalize.errors import UserError
 from personalize.media import write_wav
@@ -108,10 +110,8 @@ def test_it_goes_on_where_it_stopped(
         train(tmp_path / "base.safetensors", **{**options, "iterations": 4})
 
 
-def test_tracked_motions_train_too(
-    fake: FakeVocaset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "motions"
+def write_motions(fake: FakeVocaset, folder: Path) -> Path:
+    """Two tracked people in a folder."""
     folder.mkdir()
     for name, place in (("anna", (TRAIN[0], 1)), ("bob", (TRAIN[1], 2))):
         take = fake.takes[place]
@@ -124,6 +124,25 @@ def test_tracked_motions_train_too(
         )  # fmt: skip
         motion.save(folder / f"{name}.npz")
         write_wav(folder / f"{name}.wav", take.audio.astype(np.float32), 22_000)
+    return folder
+
+
+def test_two_processes_train_one_model(fake: FakeVocaset, tmp_path: Path) -> None:
+    folder = write_motions(fake, tmp_path / "motions")
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    out = ["--out", str(tmp_path / "base.safetensors"), "--iterations", "4", "--architecture", "attention"]
+    command = [*torchrun, "-m", "cli.main", "train", "--motions", str(folder), *out]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("modes hold") == 1, "the first process alone prints"
+    base = Checkpoint.load(tmp_path / "base.safetensors")
+    assert base.styles == ("anna", "bob") and base.config.architecture == "attention"
+
+
+def test_tracked_motions_train_too(
+    fake: FakeVocaset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_motions(fake, tmp_path / "motions")
     train(tmp_path / "base.safetensors", motions=folder, iterations=4)
     assert "modes hold" in capsys.readouterr().out
     base = Checkpoint.load(tmp_path / "base.safetensors")
@@ -231,7 +250,9 @@ def test_an_adaptation_that_diverges_has_no_figures(
         np.zeros(1, np.float32),
     )
     subject = protocol.Subject("anna", base.template, load_encoder(), [sequence], [sequence], [judged])
-    rows = protocol.compare_systems(base, train_sequences, [subject], tmp_path, 60, 0, Reporter())
+    rows = protocol.compare_systems(
+        base, train_sequences, [subject], tmp_path, TrainingConfig(iterations=60), Reporter()
+    )
     assert all((row[name] is None) == (row["seconds"] > 0) for row in rows for name in METRICS)
     json.dumps(rows, allow_nan=False)
     _print({"checkpoint": "base", "modes": 6, "held": 1.0, "systems": rows})
