@@ -1,7 +1,8 @@
 """What personalization learns, on real runs: `python -m benchmarks quality RUN [TEST_RUN] [options]`.
 
 Trains on RUN's train part, chooses the checkpoint on its val part, and tests on its test part; given TEST_RUN, it
-trains on RUN's test part as well and tests on all of TEST_RUN. The runs must have come as far as `registration`.
+trains on RUN's test part as well and tests on all of TEST_RUN. The runs must have come as far as `registration`. With
+--trained nothing is trained: it is the run's own checkpoint that is looked at.
 
 r               of the lip opening with the reference: mean of 10 samples at s = 1, and of the ridge regression from the
                 same speech features on the same seconds; `training` is on the training seconds
@@ -111,6 +112,21 @@ def guidance_curve(checkpoint: Checkpoint, test: list[Sequence], steps: int) -> 
     print("", flush=True)
 
 
+def trained(
+    subject: Checkpoint, train: list[Sequence], val: list[Sequence], config: TrainingConfig, last: bool
+) -> Checkpoint:
+    """The subject's model after training: the candidate that is best on val, or the last."""
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        candidates = Trainer(subject, train, Path(folder), config).train()
+        best, errors = choose_checkpoint(candidates, val, seed=0)
+        if last:
+            best = Checkpoint.load(candidates[-1])
+    print(f"{config.iterations} iterations in {time.perf_counter() - started:.0f} s", end="; ")
+    print(f"validation error of candidates, mm: {' '.join(f'{e:.2f}' for e in errors)}")
+    return best
+
+
 def main() -> None:
     """Train and print."""
     defaults = TrainingConfig()
@@ -129,12 +145,17 @@ def main() -> None:
     parser.add_argument("--scratch", action="store_true", help="do not start from the base model's weights")
     parser.add_argument("--steps", type=int, default=STEPS, help="of sampling")
     parser.add_argument("--curve", action="store_true", help="print the guidance curve as well")
+    parser.add_argument(
+        "--trained", action="store_true", help="RUN's own checkpoint, trained on its train part"
+    )
     parser.add_argument("--last", action="store_true", help="take the last checkpoint, not validation's")
     options = parser.parse_args()
     base, encoder = Checkpoint.load(BASE_CHECKPOINT), load_encoder()
     data = load_subject_data(RunFolder.open(options.run), len(base.styles), encoder)
     val = data.sequences("val")
-    train = data.sequences("train") + (data.sequences("test") if options.test_run else [])
+    train = data.sequences("train")
+    if options.test_run and not options.trained:
+        train += data.sequences("test")
     test = data.sequences("test")
     if options.test_run:
         other = load_subject_data(RunFolder.open(options.test_run), len(base.styles), encoder)
@@ -152,16 +173,12 @@ def main() -> None:
             regions=base.regions,
             parametrization=options.parametrization,
         )
-    names = vars(defaults).keys() & vars(options).keys()
-    config = TrainingConfig(**{name: getattr(options, name) for name in names})
-    started = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        candidates = Trainer(subject, train, Path(folder), config).train()
-        best, errors = choose_checkpoint(candidates, val, seed=0)
-        if options.last:
-            best = Checkpoint.load(candidates[-1])
-    print(f"{config.iterations} iterations in {time.perf_counter() - started:.0f} s", end="; ")
-    print(f"validation error of candidates, mm: {' '.join(f'{e:.2f}' for e in errors)}")
+    if options.trained:
+        best = Checkpoint.load(options.run / "checkpoint.safetensors")
+    else:
+        names = vars(defaults).keys() & vars(options).keys()
+        config = TrainingConfig(**{name: getattr(options, name) for name in names})
+        best = trained(subject, train, val, config, options.last)
     report(best, train, val, test, options.steps)
     if options.curve:
         guidance_curve(best, test, options.steps)
