@@ -4,7 +4,9 @@ kept.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -21,6 +23,8 @@ from model.vertex_mask import VertexMask
 # Frames x samples of one evaluation: small enough for the processor's cache, large enough for its matrix
 # products.
 CHUNK_ROWS = 1024
+# Two cores are what everyone has, and a chunk is too small to be shared out itself.
+WORKERS = 2
 
 
 @dataclass(frozen=True)
@@ -55,8 +59,8 @@ class Keep:
 
 
 class Guided:
-    """x0hat = u + s (c - u) for one audio, any number of samples; long motions in chunks with an exact
-    halo, where the network has one.
+    """x0hat = u + s (c - u) for one audio, any number of samples; long motions in chunks with an exact halo, where the
+    network has one, side by side on the processor's cores.
     """
 
     def __init__(
@@ -69,17 +73,19 @@ class Guided:
         self._guidance = guidance
         self._halo = network.halo or 0
         self._chunk = len(audio) if network.halo is None else max(chunk, 4 * network.halo)
+        self._workers = ThreadPoolExecutor(WORKERS)
 
     def __call__(self, x: Tensor, t: int) -> Tensor:
         """x [N, S, K] at diffusion step t -> x0hat [N, S, K]."""
-        length = len(x)
-        pieces = []
-        for start in range(0, length, self._chunk):
-            stop = min(start + self._chunk, length)
-            first, last = max(start - self._halo, 0), min(stop + self._halo, length)
-            piece = self._evaluate(x[first:last], t, self._condition.frames(first, last))
-            pieces.append(piece[start - first : stop - first])
-        return torch.cat(pieces)
+        return torch.cat(list(self._workers.map(partial(self._piece, x, t), range(0, len(x), self._chunk))))
+
+    @torch.inference_mode()
+    def _piece(self, x: Tensor, t: int, start: int) -> Tensor:
+        """x0hat of the chunk that begins at frame `start`."""
+        stop = min(start + self._chunk, len(x))
+        first, last = max(start - self._halo, 0), min(stop + self._halo, len(x))
+        piece = self._evaluate(x[first:last], t, self._condition.frames(first, last))
+        return piece[start - first : stop - first]
 
     def _evaluate(self, x: Tensor, t: int, condition: Condition) -> Tensor:
         """Both branches in one batch; what comes before the first condition is the same for both, and made once."""
@@ -129,7 +135,7 @@ def synthesize(
         audio,
         checkpoint.style(style),
         checkpoint.guidance if guidance is None else guidance,
-        chunk=CHUNK_ROWS // samples // 2 * 2,
+        chunk=min(CHUNK_ROWS // samples, -(-padded // WORKERS)) // 2 * 2 + 2,
     )
     overwrite = None
     if keep is not None:
