@@ -29,6 +29,7 @@ class Reporter:
         self._stage = ""
         self._stage_started = 0.0
         self._last_line = 0.0
+        self._counted = (0, 0, 0.0)  # total, done and time when this count began
         self.warnings: list[str] = []
 
     def log_to(self, path: Path) -> None:
@@ -54,6 +55,7 @@ class Reporter:
         """Around one stage: shows its name, its progress and how long it took."""
         self._stage, self._stage_started = name, time.monotonic()
         self._last_line = self._stage_started
+        self._counted = (0, 0, self._stage_started)
         self._write_log(f"{name} started")
         if self._console.is_terminal:
             columns = (
@@ -74,14 +76,22 @@ class Reporter:
         self.say(f"{name:<13} {time.monotonic() - self._stage_started:.1f} s")
 
     def progress(self, done: int, total: int) -> None:
-        """`done` of `total` steps of the running stage."""
+        """`done` of `total` steps of the running stage; another total begins another count."""
         if self._bar is not None and self._task is not None:
+            if total != self._counted[0]:
+                self._bar.reset(self._task)
+                self._counted = (total, done, 0.0)
             self._bar.update(self._task, completed=done, total=total)
             return
         now = time.monotonic()
-        if now - self._last_line >= PLAIN_LINE_EVERY_S and 0 < done < total:
+        if total != self._counted[0]:
+            # The first steps of a stage began with it; what it continues took its time in another run.
+            fresh = self._counted[0] == 0 and done <= max(1, total // 100)
+            self._counted = (total, 0, self._stage_started) if fresh else (total, done, now)
+        _, first, began = self._counted
+        if now - self._last_line >= PLAIN_LINE_EVERY_S and first < done < total:
             self._last_line = now
-            left = (now - self._stage_started) / done * (total - done)
+            left = (now - began) / (done - first) * (total - done)
             self.say(f"{self._stage:<13} {done}/{total}, about {left:.0f} s left")
 
     def _write_log(self, text: str) -> None:
