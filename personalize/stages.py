@@ -167,7 +167,7 @@ class Registration(Stage):
 class Finetune(Stage):
     """Motion + speech -> the subject's checkpoint."""
 
-    name, version, reads, resumes = "finetune", 3, ("iterations", "seed", "device"), True
+    name, version, reads, resumes = "finetune", 4, ("iterations", "seed", "device"), True
     needs = (
         "ingest/audio.wav",
         "ingest/split.json",
