@@ -14,6 +14,9 @@ class Settings:
     focal_px: focal length in pixels, None to estimate it.
     base: checkpoint that fine-tuning starts from, None for the embedded one.
     encoder: folder or hub name of the speech encoder that `base` was trained with, None for the embedded one.
+    head: FLAME pickle to track with, None for the embedded head.
+    head_embedding: its landmark embedding, None for the one that lies beside it.
+    tracked: folder of another tracker's result, to be read instead of tracking; it needs `head`.
     """
 
     iterations: int = 30_000
@@ -21,3 +24,6 @@ class Settings:
     focal_px: float | None = None
     base: str | None = None
     encoder: str | None = None
+    head: str | None = None
+    head_embedding: str | None = None
+    tracked: str | None = None

@@ -106,7 +106,9 @@ def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
     }
     for key, shape in expected.items():
         if checked[key].shape != shape or not np.isfinite(checked[key]).all():
-            raise TrackError(f"no FLAME model: {key} is {checked[key].shape}, finite numbers of {shape} needed")
+            raise TrackError(
+                f"no FLAME model: {key} is {checked[key].shape}, finite numbers of {shape} needed"
+            )
     if modes <= IDENTITIES:
         raise TrackError(
             f"no FLAME model with expressions: shapedirs holds {modes} shapes, of which {IDENTITIES} are the identity's"
@@ -127,7 +129,9 @@ def _check_points(points: SurfacePoints, faces: int) -> None:
         )
     inside = bool(count) and points.triangles.min() >= 0 and points.triangles.max() < faces
     if not inside or points.landmarks.min() < 0 or points.landmarks.max() >= POINTS:
-        raise TrackError("the landmark embedding was made for another head: it names faces that this one lacks")
+        raise TrackError(
+            "the landmark embedding was made for another head: it names faces that this one lacks"
+        )
     if not np.allclose(points.barycentric.sum(1), 1, atol=1e-3):
         raise TrackError("the landmark embedding is damaged: barycentric coordinates do not sum to 1")
 
@@ -138,7 +142,11 @@ def _joint(skeleton: Skeleton, row: int) -> Joint:
 
 
 def _embedding(
-    points: SurfacePoints, skeleton: Skeleton, template: NDArray[np.float64], faces: NDArray[np.int32], sha256: str
+    points: SurfacePoints,
+    skeleton: Skeleton,
+    template: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    sha256: str,
 ) -> LandmarkEmbedding:
     """The user's points, and the middle of each iris: the vertex of the ball that is farthest to the front."""
     landmarks, triangles, shares = [points.landmarks], [points.triangles], [points.barycentric]
@@ -151,4 +159,6 @@ def _embedding(
         landmarks.append(np.array([landmark], np.int32))
         triangles.append(np.array([row], np.int32))
         shares.append(np.eye(3, dtype=np.float32)[[corner]])
-    return LandmarkEmbedding(np.concatenate(landmarks), np.concatenate(triangles), np.concatenate(shares), sha256)
+    return LandmarkEmbedding(
+        np.concatenate(landmarks), np.concatenate(triangles), np.concatenate(shares), sha256
+    )

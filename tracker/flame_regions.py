@@ -29,7 +29,7 @@ def regions_of(
     embedding: LandmarkEmbedding,
     masks: Mapping[str, I32],
 ) -> dict[str, I32]:
-    """Name -> vertex indices, HeadModel's names. Raises TrackError where the landmarks have no inner lips."""
+    """Name -> vertex indices, HeadModel's names. Raises TrackError without inner lips, and for wrong masks."""
     at = np.einsum("lc,lcx->lx", embedding.barycentric, template[faces[embedding.triangles]])
     point = {int(index): at[row] for row, index in enumerate(embedding.landmarks)}
     upper, lower = inner_lips(template, faces, embedding)
@@ -46,7 +46,10 @@ def regions_of(
         "scalp": np.setdiff1d(skin[template[skin, 1] > brow], face),
         "neck": np.flatnonzero(skeleton.weights[:, 0] > 0.25),
     }
-    regions = told | {name: mask for name, mask in masks.items() if name in told and len(mask)}
+    given = {name: mask for name, mask in masks.items() if name in told and len(mask)}
+    if any(mask.min() < 0 or mask.max() >= len(template) for mask in given.values()):
+        raise TrackError(f"the vertex masks are for another head: they name vertices above {len(template)}")
+    regions = told | given
     regions |= {"eyelids": lids, "left_eye": balls[0], "right_eye": balls[1], "eyes": eyes}
     regions |= {"inner_lip_upper": upper, "inner_lip_lower": lower}
     regions |= {name: np.zeros(0, np.int32) for name in ABSENT}

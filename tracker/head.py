@@ -56,7 +56,7 @@ class HeadModel:
     vertex indices; `inner_lip_upper` and `inner_lip_lower` run from the right to the left corner and are paired, the
     two ends being the corners. albedo: [D, 3] u8 sRGB of a painted neutral skin. sha256: of the geometry.
     skeleton: of a head that turns its jaw and neck by joints, which then turn the eyes too; None for one that moves
-    the jaw by expressions. signed: expression weights are standard deviations of either sign and have no names' meaning.
+    the jaw by expressions. signed: expression weights are standard deviations of either sign and names mean nothing.
     """
 
     name: str

@@ -10,7 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from tracker.track import F32
 
-NECK, JAW, LEFT_EYE, RIGHT_EYE = 1, 2, 3, 4  # rows of the skeleton; row 0 is the root, which is the head's pose
+NECK, JAW, LEFT_EYE, RIGHT_EYE = (
+    1,
+    2,
+    3,
+    4,
+)  # rows of the skeleton; row 0 is the root, which is the head's pose
 
 
 @dataclass(frozen=True)
@@ -30,9 +35,11 @@ class Skeleton:
     weights: F32
     pose_basis: F32
 
-    def positions(self, identity: F32, expression: F32) -> F32:
+    def positions(self, identity: NDArray[np.floating], expression: NDArray[np.floating]) -> F32:
         """[.., J, 3] m, the joints of a shape that is not turned yet."""
-        moved = np.tensordot(identity, self.identity_basis, 1) + np.tensordot(expression, self.expression_basis, 1)
+        moved = np.tensordot(identity, self.identity_basis, 1) + np.tensordot(
+            expression, self.expression_basis, 1
+        )
         return np.asarray(self.joints + moved, np.float32)
 
     def pose(
