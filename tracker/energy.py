@@ -61,8 +61,10 @@ class Weights:
     """Standard deviation of the Gaussian prior on an expression weight."""
     signed_sd: float = 1.0
     """The same for shapes in standard deviations of either sign."""
+    jaw_open_sd: float = 0.2
+    """Standard deviation of a jaw joint's opening, rad."""
     jaw_side_sd: float = 0.02
-    """Standard deviation of a jaw joint's turn to the side, rad."""
+    """The same of its turn to the side."""
     rest: float = 30.0
     """Factor on the expression prior in frames at rest: identity, not expression, explains them."""
     acceleration: tuple[float, float, float] = (0.2, 0.005, 0.001)

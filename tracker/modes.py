@@ -74,13 +74,13 @@ def _signed_modes(head: HeadModel, weights: Weights) -> Modes:
     to_head = np.zeros((count, shapes + 3))
     to_head[:shapes, :shapes] = np.eye(shapes)
     lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
-    rate, precision = np.zeros(count), np.full(count, weights.signed_sd**-2)
+    precision = np.full(count, weights.signed_sd**-2)
     if head.skeleton is not None:
         to_head[shapes, shapes], to_head[shapes + 1, shapes + 1] = JAW_STEP, JAW_STEP
         lower[shapes], upper[shapes] = 0.0, WIDEST_JAW / JAW_STEP
-        rate[shapes], precision[shapes] = 1.0 / weights.expression_mean, weights.expression_sd**-2
-        precision[shapes + 1] = (JAW_STEP / weights.jaw_side_sd) ** 2
-    return Modes(to_head, lower, upper, rate, precision, (-np.inf, np.inf))
+        # No exponential prior: the opening would go into the shapes, which have none.
+        precision[shapes:] = (JAW_STEP / np.array([weights.jaw_open_sd, weights.jaw_side_sd])) ** 2
+    return Modes(to_head, lower, upper, np.zeros(count), precision, (-np.inf, np.inf))
 
 
 def movements(head: HeadModel) -> F32:

@@ -155,18 +155,18 @@ def test_the_jaws_mode_is_its_motion(head: HeadModel) -> None:
 
 
 def test_the_fit_finds_opening_and_pose(head: HeadModel) -> None:
-    frames, focal = 16, 1500.0
+    frames, focal, rng = 16, 1500.0, np.random.default_rng(5)
     time = np.arange(frames) / 25
     jaw = np.zeros((frames, 3), np.float32)
     jaw[:, 0] = 0.25 * np.clip(np.sin(2 * np.pi * 2 * time), 0, 1)
     expression = np.zeros((frames, 100), np.float32)
     expression[:, :4] = 0.7 * np.sin(np.outer(time, [5, 3, 4, 6]) + np.arange(4))
     identity = np.zeros(300, np.float32)
-    identity[:20] = 0.5 * RNG.normal(size=20)
+    identity[:20] = 0.5 * rng.normal(size=20)
     points = head.landmark_positions(identity, expression, jaw=jaw)
     camera = points * [1, -1, -1] + [0, 0, 0.7]
     pixels = focal * camera[..., :2] / camera[..., 2:] + [639.5, 359.5]
-    pixels += 0.3 * RNG.normal(size=pixels.shape)
+    pixels += 0.3 * rng.normal(size=pixels.shape)
     seen = np.zeros((frames, POINTS, 3), np.float32)
     seen[:, head.landmark_embedding.landmarks] = np.dstack([pixels, camera[..., 2] * focal / 0.7])
     landmarks = Landmarks(
@@ -185,6 +185,7 @@ def test_the_fit_finds_opening_and_pose(head: HeadModel) -> None:
     )  # fmt: skip
     gap = head.lip_gap_mm(head.vertices(identity, expression, jaw=jaw))
     assert np.corrcoef(track.lip_gap_mm, gap)[0, 1] > 0.995
-    assert np.sqrt(np.mean((track.lip_gap_mm - gap) ** 2)) < 1.0
-    assert np.corrcoef(track.jaw[:, 0], jaw[:, 0])[0, 1] > 0.9 and track.jaw[:, 0].min() >= 0
+    assert np.sqrt(np.mean((track.lip_gap_mm - gap) ** 2)) < 0.6
+    slope, offset = np.polyfit(jaw[:, 0], track.jaw[:, 0], 1)
+    assert 0.8 < slope < 1.1 and abs(offset) < 0.02 and track.jaw[:, 0].min() >= 0
     assert track.reprojection_px.mean() < 1.5
