@@ -27,6 +27,18 @@ def run(
         typer.Option(help="Folder or hub name of the speech encoder that --base was trained with."),
     ] = None,
     device: Annotated[str, typer.Option(help="That fine-tuning runs on: cpu or cuda.")] = Settings.device,
+    head: Annotated[
+        Path | None, typer.Option(help="FLAME pickle to track with; the embedded head if not given.")
+    ] = None,
+    head_embedding: Annotated[
+        Path | None, typer.Option(help="Landmark embedding of --head; the one beside it if not given.")
+    ] = None,
+    tracked: Annotated[
+        Path | None,
+        typer.Option(
+            help="Result folder of metrical-tracker or VHAP to use instead of tracking; with --head."
+        ),
+    ] = None,
     until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
     from_: Annotated[
         str | None, typer.Option("--from", metavar="STAGE", help="Make again from here on.")
@@ -42,8 +54,11 @@ def run(
         seed=seed,
         focal_px=focal,
         device=device,
-        base=None if base is None else str(base),
+        base=_text(base),
         encoder=encoder,
+        head=_text(head),
+        head_embedding=_text(head_embedding),
+        tracked=_text(tracked),
     )
     result = personalize_video(video, out, settings, first=from_, until=until, force=force)
     if json_:
@@ -51,3 +66,7 @@ def run(
     else:
         for name, path in result.items():
             typer.echo(f"{name:<11} {path}")
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)

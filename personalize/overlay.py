@@ -15,7 +15,7 @@ from personalize.quality import frame_reason
 from personalize.render.text import caption
 from personalize.run import RunFolder, read_landmarks, read_track
 from personalize.run import read_frames as read_frame_table
-from tracker.head import load_head
+from tracker.head import HeadModel
 from tracker.overlay import contact_sheet, draw_overlay, panel_size
 
 PREVIEW_WIDTH, PREVIEW_CRF, PREVIEW_S = 720, 30, 60.0
@@ -26,12 +26,14 @@ AUDIO_RATE = 48_000
 U8 = NDArray[np.uint8]
 
 
-def write_overlay(run: RunFolder, folder: Path, progress: Callable[[int, int], None]) -> None:
+def write_overlay(
+    run: RunFolder, head: HeadModel, folder: Path, progress: Callable[[int, int], None]
+) -> None:
     """Write overlay.mp4 with the original sound, preview.mp4 for the report, and contact_sheet.png."""
     track = read_track(run.path / "refine/track.npz")
     landmarks = read_landmarks(run.path / "landmarks/landmarks.npz")
     table = read_frame_table(run.path / "ingest/frames.npz")
-    head, total = load_head(), len(track.time)
+    total = len(track.time)
     shown = set(notable_frames(track.valid, track.confidence).tolist())
     kept: dict[int, U8] = {}
     fps = (total - 1) / float(track.time[-1]) if total > 1 else 25.0

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from model.errors import ModelError
 from personalize.errors import UserError
+from personalize.heads import run_head
 from personalize.media import probe
 from personalize.reporter import Reporter
 from personalize.run import RunFolder
@@ -18,11 +19,13 @@ from personalize.stages import (
     Ingest,
     LandmarkStage,
     Overlay,
+    ReadTracked,
     Refine,
     Registration,
     TrackStage,
 )
 from personalize.subject_data import load_base
+from personalize.tracked_files import read_tracked
 from tracker.track import TrackError
 
 STAGES: tuple[Stage, ...] = (
@@ -36,6 +39,8 @@ STAGES: tuple[Stage, ...] = (
     Finetune(),  # Motion + speech -> checkpoint.safetensors
     Evaluate(),  # metrics, a clip beside the reference, report.html
 )
+# With another tracker's result in the place of ours.
+TRACKED_STAGES: tuple[Stage, ...] = (STAGES[0], STAGES[1], ReadTracked(), *STAGES[5:])
 PRODUCTS = ("checkpoint.safetensors", "overlay.mp4", "report.html")
 
 
@@ -57,6 +62,9 @@ def personalize_video(
     probe(video)
     try:
         load_base(settings)  # asked now, not after the tracking
+        head = run_head(settings)
+        if settings.tracked is not None:
+            read_tracked(Path(settings.tracked), head)
     except ModelError as error:
         raise UserError(str(error)) from error
     folder = out or Path(f"{video.stem}.personalize")
@@ -68,7 +76,8 @@ def personalize_video(
         report.log_to(folder / "log.txt")
         run.begin(settings)
         try:
-            run_stages(STAGES, Context(run, settings, report), first=first, until=until, force=force)
+            stages = STAGES if settings.tracked is None else TRACKED_STAGES
+            run_stages(stages, Context(run, settings, report), first=first, until=until, force=force)
         except (TrackError, ModelError) as error:
             raise UserError(f"{video}: {error}") from error
     return {"run": folder} | {

@@ -45,7 +45,9 @@ def write_quality(path: Path, track: Track, frames: Frames) -> None:
     stream = io.StringIO()
     table = csv.writer(stream, lineterminator="\n")
     table.writerow(COLUMNS)
-    angles = head_angles(track.rotation)
+    # A tracker with a neck joint turns the head by it too.
+    turned = Rotation.from_rotvec(track.rotation) * Rotation.from_rotvec(track.neck)
+    angles = head_angles(turned.as_rotvec().astype(np.float32))
     for frame, time in enumerate(track.time):
         table.writerow(
             [

@@ -19,12 +19,13 @@ from model.checkpoint import Checkpoint
 from model.motion import FPS, Motion, topology_hash
 from personalize.av_sync import estimate_av_offset
 from personalize.files import write_json
+from personalize.heads import run_head
 from personalize.media import read_audio
 from personalize.reporter import Reporter
 from personalize.run import RunFolder, read_frames, read_track, tool_version
 from personalize.settings import Settings
 from personalize.subject_data import base_path
-from tracker.head import HeadModel, load_head
+from tracker.head import HeadModel
 from tracker.track import Track
 
 F32 = NDArray[np.float32]
@@ -69,7 +70,7 @@ def register_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     track = read_track(run.path / "refine/track.npz")
     base = Checkpoint.load(base_path(settings))
     motion, facts = register(
-        track, frames.segment, load_head(), BaseFace(base.template, base.faces, base.basis)
+        track, frames.segment, run_head(settings), BaseFace(base.template, base.faces, base.basis)
     )
     audio, start_s = read_audio(run.path / "ingest/audio.wav")
     offset = estimate_av_offset(track.time, track.lip_gap_mm, track.valid, audio, start_s)

@@ -132,7 +132,11 @@ def read_pickle(path: Path) -> dict[Any, Any]:
         raise UserError(
             f"{path} is larger than {LARGEST_PICKLE_BYTES >> 30} GB, the most that is read of a pickle"
         )
-    content = path.read_bytes()
+    return build_pickle(path, path.read_bytes())
+
+
+def build_pickle(path: Path, content: bytes) -> dict[Any, Any]:
+    """The same of a pickle's bytes, which are found in the file `path`."""
     try:
         value = _Builder().build(_Unpickler(path, content).load())
     except BROKEN as error:

@@ -15,6 +15,9 @@ class Settings:
     base: checkpoint that fine-tuning starts from, None for the embedded one.
     encoder: folder or hub name of the speech encoder that `base` was trained with, None for the embedded one.
     device: that fine-tuning runs on, `cpu` or `cuda`.
+    head: FLAME pickle to track with, None for the embedded head.
+    head_embedding: its landmark embedding, None for the one that lies beside it.
+    tracked: folder of another tracker's result, to be read instead of tracking; it needs `head`.
     """
 
     iterations: int = 30_000
@@ -23,3 +26,6 @@ class Settings:
     base: str | None = None
     encoder: str | None = None
     device: str = "cpu"
+    head: str | None = None
+    head_embedding: str | None = None
+    tracked: str | None = None

@@ -12,8 +12,9 @@ from model.speech import load_encoder
 from personalize import run as files
 from personalize.evaluation.evaluate import evaluate_run
 from personalize.evaluation.report import write_report
-from personalize.files import sha256_file, write_json
+from personalize.files import sha256_file, sha256_json, write_json
 from personalize.finetune import finetune_run
+from personalize.heads import head_assets, run_head
 from personalize.ingest import ingest_video
 from personalize.media import read_frames, write_wav
 from personalize.overlay import write_overlay
@@ -22,9 +23,9 @@ from personalize.registration import register_run
 from personalize.settings import Settings
 from personalize.stage import VIDEO, Context, Stage
 from personalize.subject_data import base_path
+from personalize.tracked import read_track_of
 from tracker.camera import estimate_camera
 from tracker.fit import fit_track
-from tracker.head import load_head
 from tracker.landmarker import track_landmarks
 
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
@@ -85,7 +86,7 @@ class CameraStage(Stage):
     makes = ("camera.json", "bundle.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
-        return {"head": load_head().sha256}
+        return head_assets(settings)
 
     def make(self, context: Context, folder: Path) -> None:
         root = context.run.path
@@ -93,7 +94,7 @@ class CameraStage(Stage):
         camera, bundle = estimate_camera(
             files.read_landmarks(root / "landmarks/landmarks.npz"),
             lambda: read_frames(context.run.video),
-            load_head(),
+            run_head(context.settings),
             focal_given=context.settings.focal_px,
             usable=frames.usable,
             segments=frames.segment,
@@ -110,7 +111,7 @@ class TrackStage(Stage):
     makes = ("track.npz",)
 
     def assets(self, settings: Settings) -> dict[str, str]:
-        return {"head": load_head().sha256}
+        return head_assets(settings)
 
     def make(self, context: Context, folder: Path) -> None:
         root = context.run.path
@@ -118,7 +119,7 @@ class TrackStage(Stage):
         track = fit_track(
             files.read_landmarks(root / "landmarks/landmarks.npz"),
             *files.read_camera(root / "camera"),
-            load_head(),
+            run_head(context.settings),
             frames.usable,
             frames.segment,
             context.report.progress,
@@ -139,6 +140,26 @@ class Refine(Stage):
         write_quality(folder / "quality.csv", track, files.read_frames(root / "ingest/frames.npz"))
 
 
+class ReadTracked(Stage):
+    """Another tracker's result in the place of ours: camera, track and refine in one."""
+
+    name, version = "refine", 1
+    needs, makes = ("ingest/frames.npz", "landmarks/landmarks.npz"), Refine.makes
+
+    def assets(self, settings: Settings) -> dict[str, str]:
+        folder = Path(str(settings.tracked))
+        files_of = sorted((*folder.glob("**/*.frame"), *folder.glob("tracked_flame_params*.npz")))
+        return head_assets(settings) | {"tracked": sha256_json([sha256_file(path) for path in files_of])}
+
+    def make(self, context: Context, folder: Path) -> None:
+        root, settings = context.run.path, context.settings
+        frames = files.read_frames(root / "ingest/frames.npz")
+        landmarks = files.read_landmarks(root / "landmarks/landmarks.npz")
+        track = read_track_of(Path(str(settings.tracked)), run_head(settings), frames, landmarks)
+        files.write_track(folder / "track.npz", track)
+        write_quality(folder / "quality.csv", track, frames)
+
+
 class Overlay(Stage):
     """The track over the video, to check by eye."""
 
@@ -146,8 +167,11 @@ class Overlay(Stage):
     needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", "refine/track.npz")
     makes, products = ("contact_sheet.png", "preview.mp4"), ("overlay.mp4",)
 
+    def assets(self, settings: Settings) -> dict[str, str]:
+        return head_assets(settings)
+
     def make(self, context: Context, folder: Path) -> None:
-        write_overlay(context.run, folder, context.report.progress)
+        write_overlay(context.run, run_head(context.settings), folder, context.report.progress)
 
 
 class Registration(Stage):
@@ -158,7 +182,7 @@ class Registration(Stage):
     makes = ("motion.npz", "registration.json")
 
     def assets(self, settings: Settings) -> dict[str, str]:
-        return {"head": load_head().sha256, "base": _asset_hash(base_path(settings))}
+        return head_assets(settings) | {"base": _asset_hash(base_path(settings))}
 
     def make(self, context: Context, folder: Path) -> None:
         register_run(context.run, context.settings, folder, context.report)

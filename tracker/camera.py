@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from tracker.bundle_adjustment import RigidScene, absolute_pose, adjust, camera_model
 from tracker.feature_tracks import FeatureTracks, Frame, track_features
-from tracker.head import HeadModel
-from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, UPPER_FACE
+from tracker.head import HeadModel, LandmarkEmbedding
+from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, STEADY_CORNERS, UPPER_FACE
 from tracker.track import F64, Bundle, Camera, Landmarks
 
 PRIOR_FOCAL = 1.3  # of the picture's long side: phones and webcams .7-1.2, camcorders and portraits 1.2-2.5
@@ -29,6 +29,7 @@ MIN_TURN_DEG = 8.0  # a head that turns less leaves focal length and depth undec
 OUTLIER = (
     0.08  # of the distance between the outer eye corners: farther landmarks do not count for a frame's pose
 )
+FEW = 20  # landmarks of the upper face: a user's sparse embedding has less, and most of them on the nose's ridge
 MIN_OBSERVATIONS = 12  # of a frame in the bundle
 MIN_LENGTH = 3  # observations of a point in the bundle
 MAX_DEPARTURE = (
@@ -145,7 +146,7 @@ def _turn_deg(scene: RigidScene) -> float:
 def _start(tracks: FeatureTracks, landmarks: Landmarks, head: HeadModel, camera: Camera) -> RigidScene:
     """Poses from the mean head's landmarks, and points where the tracks begin on its surface."""
     embedding = head.landmark_embedding
-    rigid = np.isin(embedding.landmarks, UPPER_FACE)
+    rigid = rigid_landmarks(embedding)
     mean = np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis))
     surface = head.landmark_positions(*mean)[rigid].astype(np.float64)
     xy = landmarks.points[tracks.frames][:, embedding.landmarks[rigid], :2].astype(np.float64)
@@ -164,6 +165,12 @@ def _start(tracks: FeatureTracks, landmarks: Landmarks, head: HeadModel, camera:
         window=tracks.window[good],
     )
     return _pruned(scene)
+
+
+def rigid_landmarks(embedding: LandmarkEmbedding) -> NDArray[np.bool_]:
+    """[L] which of a head's landmarks lie on the rigid upper face; with few of those, corners of eyes and nose too."""
+    upper = np.isin(embedding.landmarks, UPPER_FACE)
+    return upper if upper.sum() > FEW else upper | np.isin(embedding.landmarks, STEADY_CORNERS)
 
 
 def _points(tracks: FeatureTracks, xy: F64, surface: F64) -> F64:

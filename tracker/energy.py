@@ -1,6 +1,6 @@
 """The landmark energy of one face: what it measures, how it is weighted, and its analytic derivatives.
 
-A frame's unknowns are one row x = [expression weights (Ke), rotation (3), translation (3)]: the rotation
+A frame's unknowns are one row x = [weights of the modes (K), rotation (3), translation (3)]: the rotation
 is the axis-angle r (rad) of exp(r) against a head that faces the camera upright, the translation (m) that
 of the centre of the model's landmarks, so that both stay small and hardly coupled.
 """
@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tracker.track import F64, TrackError
+from tracker.modes import Modes, head_modes, movements
+from tracker.track import F64
 
 if TYPE_CHECKING:
     from tracker.head import HeadModel
@@ -58,22 +59,24 @@ class Weights:
     """The same for shapes that trade depth or side shift against pose, or that landmarks cannot see."""
     expression_sd: float = 0.5
     """Standard deviation of the Gaussian prior on an expression weight."""
+    signed_sd: float = 1.0
+    """The same for shapes in standard deviations of either sign."""
+    jaw_open_sd: float = 0.2
+    """Standard deviation of a jaw joint's opening, rad."""
+    jaw_side_sd: float = 0.02
+    """The same of its turn to the side."""
     rest: float = 30.0
     """Factor on the expression prior in frames at rest: identity, not expression, explains them."""
     acceleration: tuple[float, float, float] = (0.2, 0.005, 0.001)
     """Standard deviation of the second difference at 25 fps: weights, rotation (rad), translation (m)."""
 
 
-AMBIGUOUS = ("jawForward", "jawLeft", "jawRight", "mouthLeft", "mouthRight", "tongueOut", "cheekPuff")
-
-
 @dataclass(frozen=True)
 class LandmarkModel:
     """The head at its L fitted landmarks, centred. landmarks: [L] of the 478. pairs: [Q, 2] into L.
 
-    mean [L, 3], identity [Ki, L, 3], expression [Ke, L, 3] and centre [3] in m, head frame; normals [L, 3].
-    The column of mouthClose carries jawOpen along: 0 <= mouthClose <= jawOpen is then a plain bound.
-    upper [Ke]: upper bounds of the weights. prior [Ke]: the rate of the exponential prior.
+    mean [L, 3], identity [Ki, L, 3], expression [K, L, 3] (the modes) and centre [3] in m, head frame;
+    normals [L, 3].
     """
 
     landmarks: NDArray[np.int32]
@@ -83,29 +86,17 @@ class LandmarkModel:
     centre: F64
     normals: F64
     pairs: NDArray[np.int64]
-    prior: F64
-    close: int
-    open: int
+    modes: Modes
 
     @property
     def expressions(self) -> int:
-        """Number of expression weights."""
-        return len(self.expression)
-
-    def arkit(self, weights: F64) -> F64:
-        """[.., Ke] the head's own weights from the solver's: jawOpen includes mouthClose again, all 0..1."""
-        out = weights.copy()
-        out[..., self.open] += weights[..., self.close]
-        return np.clip(out, 0.0, 1.0)
+        """Number of modes."""
+        return len(self.modes)
 
 
 def landmark_model(head: HeadModel, weights: Weights) -> LandmarkModel:
-    """The head at the landmarks that the fit uses. Raises TrackError without ARKit's jaw shapes."""
-    names = list(head.expression_names)
-    if not {"jawOpen", "mouthClose"} <= set(names):
-        raise TrackError(
-            f"head {head.name} has no jawOpen and mouthClose: fit a head with ARKit-named shapes"
-        )
+    """The head at the landmarks that the fit uses. Raises TrackError for named shapes without ARKit's jaw."""
+    modes = head_modes(head, weights)
     embedding = head.landmark_embedding
     skip = SLIDING | set(IRISES)
     keep = np.array([index not in skip for index in embedding.landmarks.tolist()])
@@ -115,25 +106,20 @@ def landmark_model(head: HeadModel, weights: Weights) -> LandmarkModel:
     def at(field: NDArray[np.floating]) -> F64:
         return np.einsum("lc,...lcx->...lx", share, np.asarray(field, np.float64)[..., corners, :])
 
-    mean, expression = at(head.template), at(head.expression_basis)
-    opening, closing = names.index("jawOpen"), names.index("mouthClose")
-    expression[closing] += expression[opening]
+    mean = at(head.template)
     row = {int(index): i for i, index in enumerate(embedding.landmarks[keep])}
     pairs = [pair for pair in (*LIP_PAIRS, *LID_PAIRS) if row.keys() >= set(pair)]
-    rate = np.array([weights.ambiguous_mean if n in AMBIGUOUS else weights.expression_mean for n in names])
     side = np.asarray(head.template, np.float64)[corners]
     normal = np.cross(side[:, 1] - side[:, 0], side[:, 2] - side[:, 0])
     return LandmarkModel(
         landmarks=embedding.landmarks[keep].astype(np.int32),
         mean=mean - mean.mean(0),
         identity=at(head.identity_basis),
-        expression=expression,
+        expression=np.tensordot(modes.to_head, at(movements(head)), axes=1),
         centre=mean.mean(0),
         normals=normal / np.linalg.norm(normal, axis=1, keepdims=True),
         pairs=np.array([(row[a], row[b]) for a, b in pairs], int).reshape(-1, 2),
-        prior=1.0 / rate,
-        close=closing,
-        open=opening,
+        modes=modes,
     )
 
 
@@ -283,8 +269,8 @@ class Energy:
     def _prior(self, x: F64) -> tuple[F64, F64, F64]:
         """Prior of the expression weights: value [n], gradient and curvature [n, Ke]."""
         w = x[:, :-POSE]
-        rate = self.strictness[:, None] * self.model.prior
-        curve = np.broadcast_to(self.strictness[:, None] / self.weights.expression_sd**2, w.shape)
+        rate = self.strictness[:, None] * self.model.modes.rate
+        curve = self.strictness[:, None] * self.model.modes.precision
         return (rate * w + 0.5 * curve * w**2).sum(1), rate + curve * w, curve
 
 

@@ -23,7 +23,7 @@ from tracker.energy import (
 )
 from tracker.gaze import eye_rotations
 from tracker.solver import Smoothness, solve_frames, solve_subject
-from tracker.track import F64, Bundle, Camera, Landmarks, Track, TrackError
+from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track, TrackError
 
 if TYPE_CHECKING:
     from tracker.head import HeadModel
@@ -180,7 +180,8 @@ def _track(
     total = len(landmarks.time)
     nearest = _nearest(total, good)
     matrix = rotation_matrix(x[:, -6:-3])
-    expression = energy.model.arkit(x[:, :-POSE]).astype(np.float32)
+    weights = energy.model.modes.head_weights(x[:, :-POSE])
+    expression, jaw = (part.astype(np.float32) for part in weights)
     fitted = energy.project(energy.shape(identity), x)
     error = np.linalg.norm(fitted - energy.observed, axis=-1)
     valid = np.zeros(total, bool)
@@ -194,7 +195,7 @@ def _track(
         ),
         identity=identity.astype(np.float32),
         expression=expression[nearest],
-        jaw=np.zeros((total, 3), np.float32),
+        jaw=jaw[nearest],
         neck=np.zeros((total, 3), np.float32),
         eyes=eyes.astype(np.float32)[nearest],
         rotation=rotation_axis_angle(matrix).astype(np.float32)[nearest],
@@ -204,7 +205,7 @@ def _track(
         distortion=np.array(camera.distortion, np.float32),
         size=landmarks.size,
         head=f"{head.name}@{head.sha256}",
-        lip_gap_mm=_lip_gaps(head, identity, expression)[nearest],
+        lip_gap_mm=lip_gaps(head, identity, expression, jaw)[nearest],
         reprojection_px=error.mean(1).astype(np.float32)[nearest],
     )
 
@@ -215,11 +216,11 @@ def _nearest(total: int, good: Frames) -> Frames:
     return np.searchsorted(middle, np.arange(total))
 
 
-def _lip_gaps(head: HeadModel, identity: F64, expression: NDArray[np.float32]) -> NDArray[np.float32]:
+def lip_gaps(head: HeadModel, identity: NDArray[np.floating], expression: F32, jaw: F32) -> F32:
     """[n] mm, a hundred frames at a time to bound memory."""
-    subject = identity.astype(np.float32)
+    subject = np.asarray(identity, np.float32)
     parts = [
-        head.lip_gap_mm(head.vertices(np.broadcast_to(subject, (len(part), len(subject))), part))
-        for part in np.array_split(expression, max(1, len(expression) // 100))
+        head.lip_gap_mm(head.vertices(subject, expression[rows], jaw=jaw[rows]))
+        for rows in np.array_split(np.arange(len(expression)), max(1, len(expression) // 100))
     ]
     return np.concatenate(parts).astype(np.float32)

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracker.energy import Energy, rotation_matrix
+from tracker.landmark_indices import IRIS_CENTRES
 from tracker.track import F64
 
 if TYPE_CHECKING:
     from tracker.head import HeadModel
 
-IRIS_CENTRES = (473, 468)  # left, right
 EYE_RADIUS_M = 0.012  # a real eye's; the head's own eyeballs are larger and serve as lid support
 LIMIT = np.radians(45.0)
 

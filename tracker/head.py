@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from tracker.skinning import Skeleton
 from tracker.track import F32, TrackError
 
 I32 = NDArray[np.int32]
@@ -54,6 +55,8 @@ class HeadModel:
     weights 0..1, in the order of `expression_names` (ARKit's). joints: `left_eye`, `right_eye`. regions: name ->
     vertex indices; `inner_lip_upper` and `inner_lip_lower` run from the right to the left corner and are paired, the
     two ends being the corners. albedo: [D, 3] u8 sRGB of a painted neutral skin. sha256: of the geometry.
+    skeleton: of a head that turns its jaw and neck by joints, which then turn the eyes too; None for one that moves
+    the jaw by expressions. signed: expression weights are standard deviations of either sign and names mean nothing.
     """
 
     name: str
@@ -68,6 +71,8 @@ class HeadModel:
     regions: dict[str, I32]
     albedo: NDArray[np.uint8]
     landmark_embedding: LandmarkEmbedding
+    skeleton: Skeleton | None = None
+    signed: bool = False
 
     def __post_init__(self) -> None:
         if self.landmark_embedding.head_sha256 != self.sha256:
@@ -87,8 +92,8 @@ class HeadModel:
         """Pose the mesh: [.., D, 3] m in the head frame.
 
         identity: [.., Ki] standard deviations. expression: [.., Ke] weights. eyes: [.., 2, 3] axis-angle rad, left
-        then right. Leading dimensions broadcast. jaw, neck: [.., 3]; this head moves its jaw by expressions and its
-        neck with the head, so anything but zero raises TrackError.
+        then right. Leading dimensions broadcast. jaw, neck: [.., 3]; a head without a skeleton moves its jaw by
+        expressions and its neck with the head, so anything but zero raises TrackError.
         """
         return self._positions(slice(None), identity, expression, jaw, neck, eyes)
 
@@ -121,14 +126,16 @@ class HeadModel:
         neck: ArrayLike | None,
         eyes: ArrayLike | None,
     ) -> F32:
+        who, what = np.asarray(identity, np.float32), np.asarray(expression, np.float32)
+        vertices = self.template[select] + _combine(who, self.identity_basis[:, select])
+        vertices = vertices + _combine(what, self.expression_basis[:, select])
+        if self.skeleton is not None:
+            return self.skeleton.pose(vertices, select, self.skeleton.positions(who, what), jaw, neck, eyes)
         for name, rotation in (("jaw", jaw), ("neck", neck)):
             if rotation is not None and np.any(np.asarray(rotation)):
                 raise TrackError(
                     f"the head {self.name} has no {name} joint: its {name} rotation must be zero"
                 )
-        who, what = np.asarray(identity, np.float32), np.asarray(expression, np.float32)
-        vertices = self.template[select] + _combine(who, self.identity_basis[:, select])
-        vertices = vertices + _combine(what, self.expression_basis[:, select])
         if eyes is None:
             return vertices
         turns = np.asarray(eyes, np.float32)

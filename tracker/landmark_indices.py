@@ -61,4 +61,23 @@ _TEMPLES = (139, 368, 143, 372, 116, 345, 117, 346, 118, 347)
 _CHEEKS = (50, 280, 101, 330, 36, 266, 100, 329)
 _NOSE = (168, 6, 197, 195, 5, 4, 1, 19, 94, 2, 122, 351, 188, 412, 48, 278, 64, 294, 98, 327, 45, 275, 3, 248)
 # The part of the face that expressions move least; its hull lies above the mouth.
+STEADY_CORNERS = (33, 133, 362, 263, 129, 358, 98, 327, 97, 326, 75, 305)
 UPPER_FACE = (*_FOREHEAD, *_TEMPLES, *_CHEEKS, *_NOSE)
+
+# Of iBUG's 68 points those that stay on the skin, 17-67: brows, nose, eyes, outer and inner lips, each from the
+# subject's right to the left, or around from the right corner over the top.
+IBUG_51 = (
+    *(70, 63, 105, 66, 107, 336, 296, 334, 293, 300),
+    *(168, 197, 5, 4, 75, 97, 2, 326, 305),
+    *(33, 160, 158, 133, 153, 144, 362, 385, 387, 263, 373, 380),
+    *(61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181),
+    *(78, 81, 13, 311, 308, 402, 14, 178),
+)
+LIPS = (
+    *(61, 185, 40, 39, 37, 0, 267, 269, 270, 409, 291, 375, 321, 405, 314, 17, 84, 181, 91, 146),
+    *(78, 191, 80, 81, 82, 13, 312, 311, 310, 415, 308, 324, 318, 402, 317, 14, 87, 178, 88, 95),
+)
+# Inner lips from the right corner to the left one, point above point.
+INNER_LIP_UPPER = (78, 191, 80, 81, 82, 13, 312, 311, 310, 415, 308)
+INNER_LIP_LOWER = (78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308)
+IRIS_CENTRES = (473, 468)  # left, right

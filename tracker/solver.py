@@ -20,19 +20,25 @@ Progress = Callable[[int, int], None]
 Step = tuple[F64, F64]  # of the identity [Ki] and of the frames [n, P]
 
 
-def clamp(x: F64) -> F64:
-    """The weights of x [n, P] cut to 0..1."""
-    out = x.copy()
-    np.clip(out[:, :-POSE], 0.0, 1.0, out=out[:, :-POSE])
-    return out
+@dataclass(frozen=True)
+class Bounds:
+    """Lowest and highest weights, [P - POSE] each."""
 
+    lower: F64
+    upper: F64
 
-def held(x: F64, gradient: F64) -> NDArray[np.bool_]:
-    """[n, P] weights at a bound that the energy pushes further out: they stay where they are in this step."""
-    out = np.zeros(x.shape, bool)
-    w, g = x[:, :-POSE], gradient[:, :-POSE]
-    out[:, :-POSE] = ((w <= 0) & (g > 0)) | ((w >= 1) & (g < 0))
-    return out
+    def clamp(self, x: F64) -> F64:
+        """The weights of x [n, P] cut to the bounds."""
+        out = x.copy()
+        np.clip(out[:, :-POSE], self.lower, self.upper, out=out[:, :-POSE])
+        return out
+
+    def held(self, x: F64, gradient: F64) -> NDArray[np.bool_]:
+        """[n, P] weights at a bound that the energy pushes further out: they stay where they are in this step."""
+        out = np.zeros(x.shape, bool)
+        w, g = x[:, :-POSE], gradient[:, :-POSE]
+        out[:, :-POSE] = ((w <= self.lower) & (g > 0)) | ((w >= self.upper) & (g < 0))
+        return out
 
 
 def freeze(gradient: F64, hessian: F64, fixed: NDArray[np.bool_]) -> tuple[F64, F64]:
@@ -44,16 +50,18 @@ def freeze(gradient: F64, hessian: F64, fixed: NDArray[np.bool_]) -> tuple[F64, 
     return gradient * free, hessian
 
 
-def bounded_step(x: F64, gradient: F64, solve: Callable[[NDArray[np.bool_], F64], Step]) -> Step:
-    """The step of `solve` whose weights stay in 0..1.
+def bounded_step(
+    bounds: Bounds, x: F64, gradient: F64, solve: Callable[[NDArray[np.bool_], F64], Step]
+) -> Step:
+    """The step of `solve` whose weights stay within the bounds.
 
     `solve(fixed, move)` minimizes the quadratic model with the fixed unknowns displaced by `move`. What passes a bound
     is moved onto it and the rest solved again: cutting the step alone would leave the rest tuned to the uncut one.
     """
-    fixed, move = held(x, gradient), np.zeros_like(x)
+    fixed, move = bounds.held(x, gradient), np.zeros_like(x)
     step = solve(fixed, move)
     for _ in range(ROUNDS):
-        inside = clamp(x + step[1]) - x
+        inside = bounds.clamp(x + step[1]) - x
         out = (np.abs(inside - step[1]) > 1e-12) & ~fixed
         if not out.any():
             break
@@ -78,6 +86,7 @@ def solve_subject(
 ) -> Solution:
     """Identity and the n key frames together: Levenberg-Marquardt, per-frame blocks eliminated (Schur)."""
     prior = energy.weights.identity * len(x)
+    bounds = _bounds(energy)
 
     def total(identity: F64, x: F64) -> float:
         return float(energy.value(energy.shape(identity), x).sum() + 0.5 * prior * identity @ identity)
@@ -87,8 +96,8 @@ def solve_subject(
         quadratic = energy.linearize(energy.shape(identity), x, with_identity=True)
         while True:
             solve = partial(schur_step, quadratic, identity, prior, damping)
-            step_identity, step = bounded_step(x, quadratic.gradient[:, len(identity) :], solve)
-            trial_identity, trial = identity + step_identity, clamp(x + step)
+            step_identity, step = bounded_step(bounds, x, quadratic.gradient[:, len(identity) :], solve)
+            trial_identity, trial = identity + step_identity, bounds.clamp(x + step)
             trial_value = total(trial_identity, trial)
             if trial_value < value or damping > GIVE_UP:
                 break
@@ -174,13 +183,14 @@ def solve_frames(
         parts = [energy.select(part).value(shape, x[part]).sum() for part in _chunks(len(x))]
         return float(sum(parts)) + smoothness.value(x)
 
+    bounds = _bounds(energy)
     damping, value = 1e-3, total(x)
     for step in range(steps):
         gradient, hessian = _linearize(energy, shape, x)
         gradient += smoothness.gradient(x)
         while True:
             solve = partial(band_step, gradient, hessian, smoothness, damping)
-            trial = clamp(x + bounded_step(x, gradient, solve)[1])
+            trial = bounds.clamp(x + bounded_step(bounds, x, gradient, solve)[1])
             trial_value = total(trial)
             if trial_value < value or damping > GIVE_UP:
                 break
@@ -195,6 +205,10 @@ def solve_frames(
     if progress:
         progress(steps, steps)
     return x, value
+
+
+def _bounds(energy: Energy) -> Bounds:
+    return Bounds(energy.model.modes.lower, energy.model.modes.upper)
 
 
 def _chunks(n: int) -> list[slice]:

@@ -12,8 +12,16 @@ from tracker.energy import (
     rotation_vector,
     visibility,
 )
+from tracker.modes import Modes
 
 IDENTITIES, EXPRESSIONS, POINTS = 4, 5, 30
+
+
+def random_modes() -> Modes:
+    to_head = np.eye(EXPRESSIONS, EXPRESSIONS + 3)
+    to_head[0, 1] = 1.0  # mouthClose carries jawOpen along
+    rest = np.zeros(EXPRESSIONS), np.ones(EXPRESSIONS)
+    return Modes(to_head, *rest, rate=np.full(EXPRESSIONS, 5.0), precision=np.full(EXPRESSIONS, 4.0))
 
 
 def random_model(seed: int = 0) -> LandmarkModel:
@@ -27,9 +35,7 @@ def random_model(seed: int = 0) -> LandmarkModel:
         centre=np.array([0.0, 0.03, 0.08]),
         normals=np.tile([0.0, 0.0, 1.0], (POINTS, 1)),
         pairs=np.array([[0, 1], [2, 3]]),
-        prior=np.full(EXPRESSIONS, 5.0),
-        close=0,
-        open=1,
+        modes=random_modes(),
     )
 
 
@@ -106,7 +112,8 @@ def test_project_follows_the_opencv_camera():
 
 def test_head_weights_keep_mouth_close_under_jaw_open():
     weights = np.random.default_rng(0).uniform(0, 1, (100, EXPRESSIONS))
-    arkit = random_model().arkit(weights)
+    arkit, jaw = random_model().modes.head_weights(weights)
+    assert not jaw.any()
     assert (arkit[:, 0] <= arkit[:, 1]).all()
     assert arkit.min() >= 0
     assert arkit.max() <= 1

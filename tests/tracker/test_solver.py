@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 
 from tracker.energy import POSE, Quadratic
-from tracker.solver import Smoothness, band_step, bounded_step, clamp, held, schur_step
+from tracker.solver import Bounds, Smoothness, band_step, bounded_step, schur_step
 
 FRAMES, WEIGHTS, IDENTITIES = 7, 3, 4
 UNKNOWNS = WEIGHTS + POSE
+UNIT = Bounds(np.zeros(1), np.ones(1))
 
 
 def random_blocks(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -95,9 +96,9 @@ def test_weights_at_a_bound_are_held_only_when_pushed_out():
     x = np.zeros((1, UNKNOWNS))
     x[0, :3] = [0.0, 1.0, 0.5]
     inward, outward = np.full((1, UNKNOWNS), 1.0), np.full((1, UNKNOWNS), -1.0)
-    np.testing.assert_array_equal(held(x, inward)[0, :3], [True, False, False])
-    np.testing.assert_array_equal(held(x, outward)[0, :3], [False, True, False])
-    assert not held(x, inward)[0, 3:].any()
+    np.testing.assert_array_equal(UNIT.held(x, inward)[0, :3], [True, False, False])
+    np.testing.assert_array_equal(UNIT.held(x, outward)[0, :3], [False, True, False])
+    assert not UNIT.held(x, inward)[0, 3:].any()
 
 
 def test_bounded_step_finds_the_bounded_minimum():
@@ -111,11 +112,11 @@ def test_bounded_step_finds_the_bounded_minimum():
         step[0, free] = -np.linalg.solve(hessian[np.ix_(free, free)], pull[free])
         return np.zeros(0), step
 
-    step = bounded_step(x, np.zeros_like(x), solve)[1]
+    step = bounded_step(UNIT, x, np.zeros_like(x), solve)[1]
     np.testing.assert_allclose((x + step)[0, :2], [1.0, 0.7])
 
 
 def test_clamp_cuts_weights_and_not_the_pose():
     x = np.full((2, UNKNOWNS), -3.0)
-    np.testing.assert_array_equal(clamp(x)[:, :WEIGHTS], 0)
-    np.testing.assert_array_equal(clamp(x)[:, WEIGHTS:], -3)
+    np.testing.assert_array_equal(UNIT.clamp(x)[:, :WEIGHTS], 0)
+    np.testing.assert_array_equal(UNIT.clamp(x)[:, WEIGHTS:], -3)

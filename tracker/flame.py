@@ -1,0 +1,164 @@
+"""FLAME (Li et al. 2017; 2020, 2023 and 2023 Open) as a HeadModel, from the arrays of a user's own file."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from tracker.flame_regions import regions_of
+from tracker.head import HeadModel, Joint, LandmarkEmbedding
+from tracker.landmark_indices import IRIS_CENTRES, POINTS
+from tracker.skinning import JAW, LEFT_EYE, NECK, RIGHT_EYE, Skeleton
+from tracker.track import F32, TrackError
+
+IDENTITIES = 300  # of the columns of shapedirs; the others are expressions
+PARENTS = (-1, 0, 1, 1, 1)  # root, neck, jaw, left eye, right eye
+ARRAYS = ("v_template", "f", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights")
+JOINT_ROWS = {"neck": NECK, "jaw": JAW, "left_eye": LEFT_EYE, "right_eye": RIGHT_EYE}
+CLAY = (205, 186, 174)
+
+Arrays = Mapping[str, NDArray[np.generic]]
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Landmarks on FLAME's surface: [L] of the 478 points, [L] faces, [L, 3] barycentric coordinates."""
+
+    landmarks: NDArray[np.int32]
+    triangles: NDArray[np.int32]
+    barycentric: F32
+
+
+def flame_head(
+    name: str, arrays: Arrays, points: SurfacePoints, masks: Mapping[str, NDArray[np.int32]]
+) -> HeadModel:
+    """FLAME with signed expressions and joints for neck, jaw and eyes.
+
+    arrays: `v_template` [D, 3] m, `f` [F, 3], `shapedirs` [D, 3, 300 + Ke], `posedirs` [D, 3, 36],
+    `J_regressor` [5, D], `kintree_table` [2, 5], `weights` [D, 5]. points: at least the inner lips. masks: FLAME's own
+    vertex masks, empty where there are none; the regions are then told from the landmarks. Irises are added to the
+    landmarks. Raises TrackError for arrays that are missing, not finite, or do not fit each other.
+    """
+    checked = _checked(arrays)
+    template, faces, weights = checked["v_template"], checked["f"].astype(np.int32), checked["weights"]
+    _check_points(points, len(faces))
+    shapes = np.ascontiguousarray(np.moveaxis(checked["shapedirs"], -1, 0), np.float32)
+    identity, expression = shapes[:IDENTITIES], shapes[IDENTITIES:]
+    regressor = checked["J_regressor"]
+    skeleton = Skeleton(
+        parents=np.array(PARENTS, np.int32),
+        joints=(regressor @ template).astype(np.float32),
+        identity_basis=np.einsum("jd,kdx->kjx", regressor, identity).astype(np.float32),
+        expression_basis=np.einsum("jd,kdx->kjx", regressor, expression).astype(np.float32),
+        weights=weights.astype(np.float32),
+        pose_basis=np.ascontiguousarray(np.moveaxis(checked["posedirs"], -1, 0), np.float32),
+    )
+    digest = hashlib.sha256()
+    for key in ARRAYS:
+        digest.update(np.ascontiguousarray(checked[key]).tobytes())
+    embedding = _embedding(points, skeleton, template, faces, digest.hexdigest())
+    flipped = template * np.array([-1, 1, 1])
+    return HeadModel(
+        name=name,
+        sha256=digest.hexdigest(),
+        template=template.astype(np.float32),
+        faces=faces,
+        mirror=cKDTree(template).query(flipped)[1].astype(np.int32),
+        identity_basis=identity,
+        expression_basis=expression,
+        expression_names=tuple(f"expression{k + 1:03d}" for k in range(len(expression))),
+        joints={key: _joint(skeleton, row) for key, row in JOINT_ROWS.items()},
+        regions=regions_of(template, skeleton, faces, embedding, masks),
+        albedo=np.tile(np.asarray(CLAY, np.uint8), (len(template), 1)),
+        landmark_embedding=embedding,
+        skeleton=skeleton,
+        signed=True,
+    )
+
+
+def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
+    """The arrays that make the head, in double precision and of the shapes that fit each other."""
+    missing = [key for key in ARRAYS if key not in arrays]
+    if missing:
+        raise TrackError(f"no FLAME model: {', '.join(missing)} is missing")
+    try:
+        checked = {key: np.asarray(arrays[key], np.float64) for key in ARRAYS}
+    except (TypeError, ValueError) as error:
+        raise TrackError(f"no FLAME model: arrays that are no numbers ({error})") from error
+    vertices, triangles = len(checked["v_template"]), len(checked["f"])
+    shapes = checked["shapedirs"].shape
+    modes = shapes[-1] if len(shapes) == 3 else 0
+    # The root's parent is 2^32 - 1.
+    checked["kintree_table"] = np.where(checked["kintree_table"] > 4, -1, checked["kintree_table"])
+    expected = {
+        "v_template": (vertices, 3),
+        "f": (triangles, 3),
+        "shapedirs": (vertices, 3, modes),
+        "posedirs": (vertices, 3, 9 * (len(PARENTS) - 1)),
+        "J_regressor": (len(PARENTS), vertices),
+        "kintree_table": (2, len(PARENTS)),
+        "weights": (vertices, len(PARENTS)),
+    }
+    for key, shape in expected.items():
+        if checked[key].shape != shape or not np.isfinite(checked[key]).all():
+            raise TrackError(
+                f"no FLAME model: {key} is {checked[key].shape}, finite numbers of {shape} needed"
+            )
+    if modes <= IDENTITIES:
+        raise TrackError(
+            f"no FLAME model with expressions: shapedirs holds {modes} shapes, of which {IDENTITIES} are the identity's"
+        )
+    if tuple(checked["kintree_table"][0]) != PARENTS:
+        raise TrackError("no FLAME model: its joints are not root, neck, jaw, left and right eye")
+    if checked["f"].min() < 0 or checked["f"].max() >= vertices:
+        raise TrackError(f"no FLAME model: its faces name vertices above {vertices}")
+    return checked
+
+
+def _check_points(points: SurfacePoints, faces: int) -> None:
+    count = len(points.landmarks)
+    if points.triangles.shape != (count,) or points.barycentric.shape != (count, 3):
+        raise TrackError(
+            f"the landmark embedding holds {count} landmarks, {len(points.triangles)} faces and "
+            f"{len(points.barycentric)} coordinates: they must be as many"
+        )
+    inside = bool(count) and points.triangles.min() >= 0 and points.triangles.max() < faces
+    if not inside or points.landmarks.min() < 0 or points.landmarks.max() >= POINTS:
+        raise TrackError(
+            "the landmark embedding was made for another head: it names faces that this one lacks"
+        )
+    if not np.allclose(points.barycentric.sum(1), 1, atol=1e-3):
+        raise TrackError("the landmark embedding is damaged: barycentric coordinates do not sum to 1")
+
+
+def _joint(skeleton: Skeleton, row: int) -> Joint:
+    member = np.flatnonzero(skeleton.weights[:, row] > 0.5).astype(np.int32)
+    return Joint(skeleton.joints[row], skeleton.identity_basis[:, row], member)
+
+
+def _embedding(
+    points: SurfacePoints,
+    skeleton: Skeleton,
+    template: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    sha256: str,
+) -> LandmarkEmbedding:
+    """The user's points, and the middle of each iris: the vertex of the ball that is farthest to the front."""
+    landmarks, triangles, shares = [points.landmarks], [points.triangles], [points.barycentric]
+    for landmark, joint in zip(IRIS_CENTRES, (LEFT_EYE, RIGHT_EYE), strict=True):
+        ball = np.flatnonzero(skeleton.weights[:, joint] > 0.5)
+        if not len(ball) or landmark in points.landmarks:
+            continue
+        front = ball[np.argmax(template[ball, 2])]
+        row, corner = np.argwhere(faces == front)[0]
+        landmarks.append(np.array([landmark], np.int32))
+        triangles.append(np.array([row], np.int32))
+        shares.append(np.eye(3, dtype=np.float32)[[corner]])
+    return LandmarkEmbedding(
+        np.concatenate(landmarks), np.concatenate(triangles), np.concatenate(shares), sha256
+    )
