@@ -68,7 +68,7 @@ def settled(config: TrainingConfig) -> TrainingConfig:
     """The settings with this machine's answer where they leave it open: precision, then threads."""
     precision = config.precision
     if precision == "auto":
-        cuda = _available(config.device).type == "cuda"
+        cuda = available_device(config.device).type == "cuda"
         fast = torch.cuda.is_bf16_supported() if cuda else _multiplies_bfloat16()
         precision = "bfloat16" if fast else "float32"
     return replace(
@@ -81,7 +81,7 @@ def _multiplies_bfloat16() -> bool:
     return bool(torch.cpu.get_capabilities().get("amx_bf16"))
 
 
-def _available(name: str) -> torch.device:
+def available_device(name: str) -> torch.device:
     """The device of that name. Raises ModelError where this machine has none."""
     try:
         device = torch.device(name)
@@ -204,7 +204,7 @@ class Trainer:
         self._network = build_network(checkpoint.config)
         self._network.load_state_dict(checkpoint.network)
         self._objective: nn.Module = Objective(self._network, self._diffusion, weights, self.config)
-        self._objective.to(_available(self.config.device))
+        self._objective.to(available_device(self.config.device))
         self._rank, self._world = (0, 1)
         if distributed.is_initialized():
             self._rank, self._world = distributed.get_rank(), distributed.get_world_size()

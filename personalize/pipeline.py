@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from model.errors import ModelError
+from model.trainer import available_device
 from personalize.errors import UserError
 from personalize.heads import run_head
 from personalize.media import probe
@@ -61,7 +62,9 @@ def personalize_video(
     """
     probe(video)
     try:
-        load_base(settings)  # asked now, not after the tracking
+        # Asked now, not after the tracking.
+        available_device(settings.device)
+        load_base(settings)
         head = run_head(settings)
         if settings.tracked is not None:
             read_tracked(Path(settings.tracked), head)
