@@ -27,7 +27,8 @@ from model.metrics import score
 from model.motion import FPS
 from model.speech import load_encoder
 from model.synthesis import synthesize
-from model.trainer import Trainer, TrainingConfig
+from model.trainer import Trainer
+from model.training_config import TrainingConfig
 from personalize.media import read_audio
 from personalize.run import RunFolder
 from personalize.subject_data import BASE_CHECKPOINT, load_subject_data, speech_features

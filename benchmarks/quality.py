@@ -30,7 +30,8 @@ from model.metrics import lip_gap_r, lip_opening_mm, score
 from model.ridge import Ridge
 from model.speech import load_encoder
 from model.synthesis import synthesize
-from model.trainer import Trainer, TrainingConfig
+from model.trainer import Trainer
+from model.training_config import TrainingConfig
 from personalize.run import RunFolder
 from personalize.subject_data import BASE_CHECKPOINT, load_subject_data
 from tracker.head import load_head

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from model.checkpoint import Checkpoint
 from model.dataset import Sequence, Standardization
-from model.trainer import Trainer, TrainingConfig
+from model.trainer import Trainer
+from model.training_config import TrainingConfig
 
 MODES, WIDTH, VERTICES, FRAMES = 52, 384, 4843, 1800
 ITERATIONS = TrainingConfig.iterations

@@ -22,8 +22,9 @@ from model.denoiser import NetworkConfig
 from model.diffusion import STEPS, Diffusion
 from model.motion import FPS
 from model.network import Network
+from model.objective import Draws, Objective
 from model.synthesis import CHUNK_ROWS, Guided
-from model.trainer import Draws, Objective, TrainingConfig
+from model.training_config import TrainingConfig
 
 SECONDS = 60.0
 PARTS = 8

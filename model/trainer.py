@@ -5,174 +5,32 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Many
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from torch import Tensor, distributed, nn
+from torch import Tensor, distributed
 from torch.nn.parallel import DistributedDataParallel
 
 from model.architectures import build_network
 from model.checkpoint import Checkpoint, State, read_tensors, serialize, write_atomically
 from model.dataset import Batch, Crops, Sequence
-from model.denoiser import Denoiser
 from model.diffusion import Diffusion, Progress
 from model.errors import ModelError
+from model.objective import Draws, Objective, SharedGradient, coefficient_weights
+from model.training_config import TrainingConfig, available_device, settled
 from model.training_log import TrainingLog
 
 STATE_FILE = "state.safetensors"
 LOG_FILE = "log.csv"
 
 
-@dataclass(frozen=True)
-class TrainingConfig:
-    """The paper's settings; what the paper is silent about says so."""
-
-    iterations: int = 30_000
-    batch: int = 64
-    frames: int = 30
-    """Length of a crop."""
-    learning_rate: float = 1e-3
-    """The paper's is 1e-4, in vertex space; standardized coefficients bear more and need it (docs/method.md)."""
-    unconditional: float = 0.1
-    """Share of the batch whose audio condition is zeroed."""
-    velocity: float = 10.0
-    """Weight of the velocity term."""
-    metric_power: float = 0.5
-    """A coefficient weighs scale^power: 2 is the paper's vertex metric; see `coefficient_weights` (ours)."""
-    ema: float = 0.999
-    """Decay of the averaged weights (ours)."""
-    feature_dropout: float = 0.3
-    """Share of the speech channels zeroed in a crop: less is learned by heart (ours; docs/method.md)."""
-    weight_decay: float = 0.3
-    """AdamW's, decoupled from the gradient: keeps samples from agreeing too much (ours; docs/method.md)."""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Of the matrix products; weights, loss and sums stay in float32. auto: bfloat16 where it is fast (ours)."""
-    device: str = "cpu"
-    """`cpu`, `cuda`, `cuda:1`, … ; one device and one seed repeat to the byte (ours)."""
-    candidates: int = 10
-    """Checkpoints kept on the way, evenly spaced, for the choice on validation."""
-    seed: int = 0
-    threads: int = 0
-    """For torch, while training; 0: two, or one in bfloat16, which gains nothing from a second (ours)."""
-    save_seconds: float = 20.0
-    """A killed run loses at most this much (ours)."""
-    log_every: int = 50
-
-
-def settled(config: TrainingConfig) -> TrainingConfig:
-    """The settings with this machine's answer where they leave it open: precision, then threads."""
-    precision = config.precision
-    if precision == "auto":
-        cuda = available_device(config.device).type == "cuda"
-        fast = torch.cuda.is_bf16_supported() if cuda else _multiplies_bfloat16()
-        precision = "bfloat16" if fast else "float32"
-    return replace(
-        config, precision=precision, threads=config.threads or (1 if precision == "bfloat16" else 2)
-    )
-
-
-def _multiplies_bfloat16() -> bool:
-    """Whether the processor has tiles for it (AMX); elsewhere it is slower than float32."""
-    return bool(torch.cpu.get_capabilities().get("amx_bf16"))
-
-
-def available_device(name: str) -> torch.device:
-    """The device of that name. Raises ModelError where this machine has none."""
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise ModelError(f"device {name!r} is not known; use cpu or cuda") from None
-    if device.type not in ("cpu", "cuda") or (device.type == "cuda" and not torch.cuda.is_available()):
-        raise ModelError(f"device {name!r} is not there; use cpu")
-    return device
-
-
 class TrainingDivergedError(ModelError):
     """The loss became infinite or rose far above what predicting nothing costs."""
-
-
-def coefficient_weights(scale: Tensor, power: float) -> Tensor:
-    """[K]: what a standardized squared residual weighs in the loss, scale^power, summing to 1.
-
-    Power 2 is the vertex metric: the basis is orthonormal, so sum_k scale_k^2 r_k^2 is the squared vertex distance.
-    There the small coefficients get no gradient to speak of, and are sampled as white noise that shakes the face; a
-    power of 1/2 measured best (docs/method.md). A loss of 1 is what predicting the mean motion costs.
-    """
-    weights = scale**power
-    return weights / weights.sum()
-
-
-def objective(x0: Tensor, predicted: Tensor, weights: Tensor, velocity: float) -> Tensor:
-    """METHOD 4: ||x0 - x0hat||^2 + velocity ||dx0 - dx0hat||^2, each a mean over its frames; [N, B, K] ->
-    scalar.
-    """
-    residual = x0 - predicted
-    change = residual[1:] - residual[:-1]
-    frames, batch = x0.shape[0], x0.shape[1]
-    position = (residual.square() @ weights).sum() / (frames * batch)
-    return position + velocity * (change.square() @ weights).sum() / ((frames - 1) * batch)
-
-
-@dataclass(frozen=True)
-class Draws:
-    """The randomness of one step but the crops: t [B] diffusion steps, noise [N, B, K], keep [B], channels [B, W or 1].
-
-    keep: 0 where the speech is zeroed. channels: 0 where a speech channel is, the rest scaled to the same mean.
-    """
-
-    t: Tensor
-    noise: Tensor
-    keep: Tensor
-    channels: Tensor
-
-    def part(self, rows: slice) -> Draws:
-        """Of some of the batch."""
-        return Draws(self.t[rows], self.noise[:, rows], self.keep[rows], self.channels[rows])
-
-    def to(self, device: str) -> Draws:
-        """On a device."""
-        return Draws(*(value.to(device) for value in vars(self).values()))
-
-    @classmethod
-    def of(cls, batch: Batch, steps: int, config: TrainingConfig, generator: torch.Generator) -> Draws:
-        """For a batch, from the generator."""
-        count, width = batch.audio.shape[1:]
-        t = torch.randint(steps, (count,), generator=generator)
-        keep = (torch.rand(count, generator=generator) >= config.unconditional).float()
-        noise = torch.randn(batch.motion.shape, generator=generator)
-        channels = torch.ones(count, 1)
-        if config.feature_dropout:
-            channels = (torch.rand((count, width), generator=generator) >= config.feature_dropout).float()
-            channels = channels / (1 - config.feature_dropout)
-        return cls(t, noise, keep, channels)
-
-
-class Objective(nn.Module):
-    """The loss of a batch under given draws: one module, so that it can be spread over processes as a whole."""
-
-    def __init__(
-        self, network: Denoiser, diffusion: Diffusion, weights: Tensor, config: TrainingConfig
-    ) -> None:
-        super().__init__()
-        self.network = network
-        self._diffusion, self._velocity, self._precision = diffusion, config.velocity, config.precision
-        self.weights: Tensor
-        self.register_buffer("weights", weights, persistent=False)
-
-    def forward(self, batch: Batch, draws: Draws) -> Tensor:
-        """Scalar; see `objective`."""
-        kind = batch.motion.device.type
-        with torch.autocast(kind, torch.bfloat16, enabled=self._precision == "bfloat16"):
-            x_t = self._diffusion.add_noise(batch.motion, draws.t, draws.noise)
-            condition = self.network.condition(batch.audio * draws.channels, draws.keep)
-            output = self.network(x_t, draws.t, condition, batch.style).float()
-        predicted = self._diffusion.x0(output, x_t, draws.t)
-        return objective(batch.motion, predicted, self.weights, self._velocity)
 
 
 class Trainer:
@@ -203,12 +61,13 @@ class Trainer:
         self._diffusion: Diffusion = checkpoint.diffusion()
         self._network = build_network(checkpoint.config)
         self._network.load_state_dict(checkpoint.network)
-        self._objective: nn.Module = Objective(self._network, self._diffusion, weights, self.config)
-        self._objective.to(available_device(self.config.device))
+        objective = Objective(self._network, self._diffusion, weights, self.config)
+        objective.to(available_device(self.config.device))
+        self._gradient: Callable[[Batch, Draws], Tensor] = SharedGradient(objective, self.config.threads)
         self._rank, self._world = (0, 1)
         if distributed.is_initialized():
             self._rank, self._world = distributed.get_rank(), distributed.get_world_size()
-            self._objective = DistributedDataParallel(self._objective)
+            self._gradient = _averaged(DistributedDataParallel(objective))
         # In the network's own order, which a loaded file does not keep: the average follows tensor by tensor.
         self._average = {name: value.clone() for name, value in self._network.state_dict().items()}
         self._optimizer = torch.optim.AdamW(
@@ -231,7 +90,7 @@ class Trainer:
         saved = time.monotonic()
         # Of several processes only the first writes.
         log_file = self.folder / LOG_FILE if self._rank == 0 else None
-        with _threads(self.config.threads), TrainingLog(log_file, self.step, self._tensorboard) as log:
+        with _one_thread(), TrainingLog(log_file, self.step, self._tensorboard) as log:
             while self.step < self.config.iterations:
                 self._losses.append(self._iterate())
                 self.step += 1
@@ -269,12 +128,10 @@ class Trainer:
         draws = Draws.of(batch, self._diffusion.steps, self.config, generator)
         mine = slice(self._rank, None, self._world)
         device = self.config.device
-        loss = self._objective(batch.part(mine).to(device), draws.part(mine).to(device))
-        self._optimizer.zero_grad()
-        loss.backward()
+        loss = self._gradient(batch.part(mine).to(device), draws.part(mine).to(device))
         self._optimizer.step()
         self._follow()
-        return loss.detach()
+        return loss
 
     @torch.no_grad()
     def _follow(self) -> None:
@@ -346,11 +203,23 @@ class Trainer:
         self.step = int(metadata["step"])
 
 
+def _averaged(objective: DistributedDataParallel) -> Callable[[Batch, Draws], Tensor]:
+    """Loss of this process's share of a batch; the gradients become the mean of all processes'."""
+
+    def gradient(batch: Batch, draws: Draws) -> Tensor:
+        objective.zero_grad()
+        loss: Tensor = objective(batch, draws)
+        loss.backward()
+        return loss.detach()
+
+    return gradient
+
+
 @contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """torch on so many threads inside the block."""
+def _one_thread() -> Iterator[None]:
+    """Within torch's own operations, inside the block."""
     before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    torch.set_num_threads(1)
     try:
         yield
     finally:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from model.finetuning import choose_checkpoint, subject_of, sweep_guidance
 from model.speech import load_encoder
-from model.trainer import Trainer, TrainingConfig
+from model.trainer import Trainer
+from model.training_config import TrainingConfig
 from personalize.errors import UserError
 from personalize.files import sha256_file, write_json
 from personalize.reporter import Reporter

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from model.errors import ModelError
-from model.trainer import available_device
+from model.training_config import available_device
 from personalize.errors import UserError
 from personalize.heads import run_head
 from personalize.media import probe

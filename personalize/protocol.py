@@ -18,7 +18,8 @@ from model.metrics import score
 from model.motion import FPS
 from model.speech import SpeechEncoder, resample
 from model.synthesis import synthesize
-from model.trainer import Trainer, TrainingConfig, TrainingDivergedError
+from model.trainer import Trainer, TrainingDivergedError
+from model.training_config import TrainingConfig
 from personalize.feature_cache import encode_cached
 from personalize.files import write_json
 from personalize.reporter import Reporter

@@ -22,7 +22,8 @@ from model.motion_basis import MotionBasis, motion_basis
 from model.processes import joined
 from model.speech import SpeechEncoder, load_encoder
 from model.speech_windows import SpeechError
-from model.trainer import Trainer, TrainingConfig
+from model.trainer import Trainer
+from model.training_config import TrainingConfig
 from personalize.corpus import Corpus, check_parts, tested, there
 from personalize.errors import UserError
 from personalize.mouth import mouth_regions

@@ -20,7 +20,8 @@ from model.checkpoint import Checkpoint
 from model.dataset import Sequence, Standardization
 from model.motion import FPS
 from model.speech import SpeechEncoder, load_encoder, resample
-from model.trainer import Trainer, TrainingConfig
+from model.trainer import Trainer
+from model.training_config import TrainingConfig
 from personalize.talkers.motion import talker_motion
 from personalize.talkers.style import Style
 from tools.flite_voices import SAMPLE_RATE, VOICES, monologue, record

@@ -8,7 +8,7 @@ import torch
 from model.denoiser import NetworkConfig
 from model.diffusion import Diffusion, Parametrization
 from model.network import HALO, Network
-from model.trainer import coefficient_weights, objective
+from model.objective import coefficient_weights, objective
 from tests.model import talker
 
 K, W, V = talker.K, talker.W, 3 * talker.D

@@ -20,7 +20,8 @@ from model.motion import Motion
 from model.motion_basis import motion_basis
 from model.speech import load_encoder
 from model.synthesis import synthesize
-from model.trainer import TrainingConfig, TrainingDivergedError
+from model.trainer import TrainingDivergedError
+from model.training_config import TrainingConfig
 from personalize import protocol
 from personalize.errors import UserError
 from personalize.media import write_wav
