@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from model.basis import common_basis, orthonormal
 from model.checkpoint import Checkpoint
-from model.diffusion import Progress, Rule
 from model.errors import ModelError
 from model.metrics import isometry, seam
 from model.motion import Motion
-from model.synthesis import Keep, synthesize
+from model.synthesis import Keep, Sampling, synthesize
 from model.vertex_mask import VertexMask
 
 F32 = NDArray[np.float32]
@@ -38,16 +38,9 @@ def edit(
     checkpoint: Checkpoint,
     features: F32 | None,
     kept: Kept,
-    *,
-    style: str | None = None,
-    guidance: float | None = None,
-    samples: int = 1,
-    seed: int = 0,
-    rule: Rule = "posterior",
-    steps: int | None = None,
-    progress: Progress | None = None,
+    **sampling: Unpack[Sampling],
 ) -> list[Motion]:
-    """Speech features [N, W] at the motion's frames -> `samples` motions on its template and clock.
+    """Speech features [N, W] at the motion's frames -> motions on its template and clock, drawn like `synthesize`'s.
 
     features None: unconditional, guidance is 0 then. Kept frames and vertices return as they are, to rounding of
     float32. The basis is the checkpoint's where whole frames in that basis are kept; else one that holds the result.
@@ -56,24 +49,15 @@ def edit(
     motion = kept.motion
     _check(checkpoint, kept)
     if features is None:
-        features, guidance = np.zeros((len(motion.valid), checkpoint.config.audio_width), np.float32), 0.0
+        features = np.zeros((len(motion.valid), checkpoint.config.audio_width), np.float32)
+        sampling["guidance"] = 0.0
     basis, ours, theirs = common_basis(checkpoint.basis, motion.basis)
     known = np.where(motion.valid[:, None], motion.coefficients, 0) @ theirs
     mask = None
     if kept.share is not None:
         mask = VertexMask.of(checkpoint.basis, kept.share, motion, motion.valid & ~kept.frames)
-    drawn = synthesize(
-        checkpoint,
-        features,
-        style=style,
-        guidance=guidance,
-        samples=samples,
-        seed=seed,
-        rule=rule,
-        steps=steps,
-        keep=Keep((known @ ours.T).astype(np.float32), kept.frames, mask),
-        progress=progress,
-    )
+    keep = Keep((known @ ours.T).astype(np.float32), kept.frames, mask)
+    drawn = synthesize(checkpoint, features, keep=keep, **sampling)
     made = np.where(kept.frames[:, None], known, drawn @ ours)
     if kept.share is not None:
         # displacement = (1 - m) · made + m · known, and only here the vertices that are kept leave the basis.

@@ -7,6 +7,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import TypedDict
 
 import numpy as np
 import torch
@@ -93,6 +94,18 @@ class Guided:
         output = self._network(both, step, condition, self._style)
         conditional, unconditional = self._diffusion.x0(output, both, step).unbind(dim=1)
         return unconditional + self._guidance * (conditional - unconditional)
+
+
+class Sampling(TypedDict, total=False):
+    """How `synthesize` draws; what is left out is its default."""
+
+    style: str | None
+    guidance: float | None
+    samples: int
+    seed: int
+    rule: Rule
+    steps: int | None
+    progress: Progress | None
 
 
 @torch.inference_mode()
