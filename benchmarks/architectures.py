@@ -133,7 +133,7 @@ def main() -> None:
     parser.add_argument("--parametrization", choices=PARAMETRIZATIONS, default="skip")
     parser.add_argument("--guidance", type=float, nargs="+", default=[1.0, 0.5])
     parser.add_argument("--steps", type=int, default=STEPS, help="of the reverse chain")
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--threads", type=int, default=TrainingConfig.threads)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     base = Checkpoint.load(BASE_CHECKPOINT)

@@ -2,7 +2,8 @@
 
 Trains on RUN's train part, chooses the checkpoint on its val part, and tests on its test part; given TEST_RUN, it
 trains on RUN's test part as well and tests on all of TEST_RUN. The runs must have come as far as `registration`. With
---trained nothing is trained: it is the run's own checkpoint that is looked at.
+--with-val it trains on the val part too and takes the last checkpoint, and ridge has the same seconds, under the
+penalty that val chose before. With --trained nothing is trained: it is the run's own checkpoint that is looked at.
 
 r               of the lip opening with the reference: mean of 10 samples at s = 1, and of the ridge regression from the
                 same speech features on the same seconds; `training` is on the training seconds
@@ -86,10 +87,9 @@ def draw(checkpoint: Checkpoint, sequences: list[Sequence], s: float, samples: i
 
 
 def report(
-    checkpoint: Checkpoint, train: list[Sequence], val: list[Sequence], test: list[Sequence], steps: int
+    checkpoint: Checkpoint, ridge: Ridge, train: list[Sequence], test: list[Sequence], steps: int
 ) -> None:
     """The first table."""
-    ridge = Ridge.fit(train, val)
     predicted = together(checkpoint, [ridge.predict(q.features)[None] for q in test], test)
     at = {s: together(checkpoint, draw(checkpoint, test, s, SAMPLES, steps), test) for s in (0.0, 0.5, 1.0)}
     longest = sorted(train, key=lambda q: -len(q.valid))[:4]
@@ -149,6 +149,9 @@ def main() -> None:
     parser.add_argument(
         "--trained", action="store_true", help="RUN's own checkpoint, trained on its train part"
     )
+    parser.add_argument(
+        "--with-val", action="store_true", help="train on the val part as well; implies --last"
+    )
     parser.add_argument("--last", action="store_true", help="take the last checkpoint, not validation's")
     options = parser.parse_args()
     base, encoder = Checkpoint.load(BASE_CHECKPOINT), load_encoder()
@@ -161,6 +164,10 @@ def main() -> None:
     if options.test_run:
         other = load_subject_data(RunFolder.open(options.test_run), len(base.styles), encoder)
         test = [q for part in ("train", "val", "test") for q in other.sequences(part)]
+    ridge = Ridge.fit(train, val)
+    if options.with_val:
+        train += val
+        ridge = Ridge.fit(train, val, (ridge.penalty,))
     subject = subject_of(base, "subject", train, {})
     if options.scratch or options.parametrization != base.parametrization:
         subject = Checkpoint.initial(
@@ -179,8 +186,8 @@ def main() -> None:
     else:
         names = vars(defaults).keys() & vars(options).keys()
         config = TrainingConfig(**{name: getattr(options, name) for name in names})
-        best = trained(subject, train, val, config, options.last)
-    report(best, train, val, test, options.steps)
+        best = trained(subject, train, val, config, options.last or options.with_val)
+    report(best, ridge, train, test, options.steps)
     if options.curve:
         guidance_curve(best, test, options.steps)
 

@@ -35,8 +35,8 @@ class Ridge:
     penalty: float
 
     @classmethod
-    def fit(cls, train: Many[Sequence], val: Many[Sequence]) -> Ridge:
-        """Least squares with every lambda of LAMBDAS on the valid frames of train; the best on val is kept.
+    def fit(cls, train: Many[Sequence], val: Many[Sequence], lambdas: Many[float] = LAMBDAS) -> Ridge:
+        """Least squares with every lambda on the valid frames of train; the best on val is kept.
 
         The error is the squared vertex distance, since the basis is orthonormal. Raises ModelError where either
         has no valid frame.
@@ -45,10 +45,10 @@ class Ridge:
         x_val, y_val = _rows(val, "validation")
         mean, scale, offset = x.mean(axis=0), x.std(axis=0) + 1e-6, y.mean(axis=0)
         x, x_val = (x - mean) / scale, (x_val - mean) / scale
-        solutions = [_solve(x, y - offset, penalty * len(x)) for penalty in LAMBDAS]
+        solutions = [_solve(x, y - offset, penalty * len(x)) for penalty in lambdas]
         errors = [float(((x_val @ weights + offset - y_val) ** 2).sum()) for weights in solutions]
         best = int(np.argmin(errors))
-        return cls(mean, scale, solutions[best], offset, LAMBDAS[best])
+        return cls(mean, scale, solutions[best], offset, lambdas[best])
 
     def predict(self, features: F32) -> F32:
         """Speech features [N, W] at the motion's frames -> coefficients [N, K] m."""
