@@ -104,7 +104,9 @@ class Checkpoint:
 
     def diffusion(self) -> Diffusion:
         """The diffusion that it was trained with."""
-        return Diffusion(self.schedule, self.parametrization)
+        return Diffusion(
+            self.schedule, self.parametrization, spread=torch.from_numpy(self.standardization.spread)
+        )
 
     def model(self) -> Denoiser:
         """The network with its averaged weights, ready to evaluate."""
@@ -194,7 +196,9 @@ def _assemble(tensors: dict[str, Tensor], metadata: dict[str, str]) -> Checkpoin
     if kind not in ("base", "subject"):
         raise ValueError(f"kind {kind!r}")
     config = NetworkConfig(**json.loads(metadata["network"]))
-    standardization = Standardization(**{n: t.numpy() for n, t in group("standardization.").items()})
+    statistics = {name: value.numpy() for name, value in group("standardization.").items()}
+    # Before there was a spread, the skip took it as one.
+    standardization = Standardization(**{"spread": np.ones_like(statistics["scale"])} | statistics)
     basis, template, faces = (tensors[name].numpy() for name in ("basis", "template", "faces"))
     styles = tuple(json.loads(metadata["styles"]))
     if (
@@ -205,8 +209,9 @@ def _assemble(tensors: dict[str, Tensor], metadata: dict[str, str]) -> Checkpoin
         raise ValueError(f"shapes {basis.shape}, {template.shape}, {faces.shape} of basis, template, faces")
     if len(styles) != config.styles:
         raise ValueError(f"{len(styles)} style names for {config.styles} styles")
-    if standardization.scale.shape != (config.coefficients,) or not (standardization.scale > 0).all():
-        raise ValueError("scale of the coefficients")
+    shapes = {standardization.scale.shape, standardization.spread.shape, standardization.mean.shape}
+    if shapes != {(config.coefficients,)} or not (standardization.scale > 0).all():
+        raise ValueError("mean, scale or spread of the coefficients")
     checkpoint = Checkpoint(
         kind="base" if kind == "base" else "subject",
         encoder=metadata["encoder"],

@@ -17,6 +17,10 @@ from model.errors import ModelError
 # A coefficient that hardly moves is not blown up to unit variance: its scale is at least this share of the
 # largest.
 SMALLEST_SCALE = 0.01
+# A coefficient that is mostly still and seldom jumps (an eyelid) is scaled so that it hardly ever exceeds this value.
+# In standard deviations a blink may be 10: whether there is one would be decided by steps whose noise leaves nothing
+# else to see, and the model forgets to blink (docs/method.md).
+LARGEST_VALUE, LARGEST_QUANTILE = 4.0, 0.999
 
 
 @dataclass(frozen=True)
@@ -46,30 +50,33 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Standardization:
-    """What maps a person's numbers to the network's: coefficients [K] m and speech features [W], mean and
-    scale.
+    """What maps a person's numbers to the network's: coefficients [K] m and speech features [W], mean and scale.
+
+    spread: [K] standard deviation of the standardized coefficients, 1 where the scale is their own.
     """
 
     mean: NDArray[np.float32]
     scale: NDArray[np.float32]
+    spread: NDArray[np.float32]
     audio_mean: NDArray[np.float32]
     audio_scale: NDArray[np.float32]
 
     @classmethod
     def of(cls, sequences: Many[Sequence]) -> Standardization:
-        """Mean and standard deviation over the valid frames of all sequences; ModelError where there are
-        none.
-        """
+        """Statistics over the valid frames of all sequences; ModelError where there are none."""
         motion = np.concatenate([s.coefficients[s.valid] for s in sequences]).astype(np.float64)
         audio = np.concatenate([s.features[s.valid] for s in sequences]).astype(np.float64)
         if len(motion) < 2:
             raise ModelError(f"{len(motion)} valid frames of motion: there is nothing to learn from")
-        scale, audio_scale = motion.std(axis=0), audio.std(axis=0)
-        if scale.max() <= 0:
+        mean, sd, audio_scale = motion.mean(axis=0), motion.std(axis=0), audio.std(axis=0)
+        if sd.max() <= 0:
             raise ModelError("the motion does not move at all: there is nothing to learn from")
+        largest = np.quantile(np.abs(motion - mean), LARGEST_QUANTILE, axis=0)
+        scale = np.maximum(np.maximum(sd, largest / LARGEST_VALUE), SMALLEST_SCALE * sd.max())
         return cls(
-            mean=motion.mean(axis=0).astype(np.float32),
-            scale=np.maximum(scale, SMALLEST_SCALE * scale.max()).astype(np.float32),
+            mean=mean.astype(np.float32),
+            scale=scale.astype(np.float32),
+            spread=(sd / scale).astype(np.float32),
             audio_mean=audio.mean(axis=0).astype(np.float32),
             audio_scale=np.maximum(audio_scale, 1e-6 + SMALLEST_SCALE * audio_scale.max()).astype(np.float32),
         )

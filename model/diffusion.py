@@ -44,6 +44,19 @@ def linear_alphas(steps: int) -> Tensor:
     return torch.cumprod(1 - torch.clamp(betas, max=0.999), dim=0)
 
 
+def preconditioning(alphas: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
+    """Skip and gain [steps, K] f32, from abar_t [steps, 1] and the data's standard deviation [K], both f64.
+
+    skip x_t is the best linear guess of x0, gain the standard deviation of what it misses (Karras et al. 2022, eq. 7,
+    in variance-preserving form): sqrt(abar_t) and sqrt(1 - abar_t) for unit variance.
+    """
+    variance = spread**2
+    total = variance * alphas + 1 - alphas
+    skip = variance * alphas.sqrt() / total
+    gain = spread * ((1 - alphas) / total).sqrt()
+    return skip.float(), gain.float()
+
+
 class Diffusion:
     """T steps, t = 0 (almost clean) .. T - 1 (almost pure noise)."""
 
@@ -52,7 +65,9 @@ class Diffusion:
         schedule: Schedule = "cosine",
         parametrization: Parametrization = "skip",
         steps: int = STEPS,
+        spread: Tensor | None = None,
     ) -> None:
+        """spread: [K] standard deviation of the data; None for 1."""
         if schedule not in SCHEDULES:
             raise ModelError(f"schedule {schedule!r} is not known; use one of {', '.join(SCHEDULES)}")
         if parametrization not in PARAMETRIZATIONS:
@@ -64,6 +79,8 @@ class Diffusion:
         self.alphas = cosine_alphas(steps) if schedule == "cosine" else linear_alphas(steps)
         self._signal = self.alphas.sqrt().float()
         self._noise = (1 - self.alphas).sqrt().float()
+        sd = torch.ones(1) if spread is None else spread
+        self._skip, self._gain = preconditioning(self.alphas[:, None], sd.double())
 
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
         """q(x_t | x0) = N(sqrt(abar_t) x0, (1 - abar_t) I), at the given unit noise; t [*b], x0 [N, *b,
@@ -75,14 +92,12 @@ class Diffusion:
     def x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
         """The network's output [N, *b, K] as x0hat.
 
-        `plain` is the paper's: the output itself. `skip`: sqrt(abar_t) x_t + sqrt(1 - abar_t) output, the
-        best linear guess for unit-variance x0 plus a correction: the network need not learn a gain that
-        depends on t.
+        `plain` is the paper's: the output itself. `skip`: skip_t x_t + gain_t output, see `preconditioning`: the
+        network need not learn a gain that depends on t.
         """
         if self.parametrization == "plain":
             return output
-        signal, level = self._levels(t)
-        return signal * x_t + level * output
+        return self._skip.to(t.device)[t] * x_t + self._gain.to(t.device)[t] * output
 
     def _levels(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """sqrt(abar_t) and sqrt(1 - abar_t) of steps t [*b], [*b, 1] each, on their device."""

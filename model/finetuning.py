@@ -29,11 +29,11 @@ SYNC_TOLERANCE = 1.05
 def subject_of(base: Checkpoint, name: str, train: Many[Sequence], provenance: dict[str, Any]) -> Checkpoint:
     """The base model with a style row of the subject's own, the mean of the others, ready for fine-tuning.
 
-    The coefficients are standardized anew, since the skip assumes unit variance, and the ratio of the scales goes
+    The coefficients are standardized anew, since the skip assumes their variance, and the ratio of the scales goes
     into encoder and decoder, so that the network still says the same in metres. Speech keeps the base's scale.
     """
     own, old = Standardization.of(train), base.standardization
-    standardization = Standardization(own.mean, own.scale, old.audio_mean, old.audio_scale)
+    standardization = replace(own, audio_mean=old.audio_mean, audio_scale=old.audio_scale)
     ratio = torch.from_numpy(own.scale / old.scale)
     config = replace(base.config, styles=len(base.styles) + 1)
 

@@ -112,6 +112,11 @@ def test_missing_parts(path: Path, missing: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_file_from_before_there_was_a_spread(path: Path) -> None:
+    rewritten(path, drop="standardization.spread")
+    assert np.array_equal(Checkpoint.load(path).standardization.spread, np.ones(talker.K))
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -122,6 +127,7 @@ def test_missing_parts(path: Path, missing: str) -> None:
         {"metadata": {"guidance": "much"}},
         {"basis": torch.zeros(5, talker.D, 3)},
         {"standardization.scale": torch.zeros(talker.K)},
+        {"standardization.spread": torch.ones(2)},
         {"ema.decoder.bias": torch.zeros(2)},
     ],
 )

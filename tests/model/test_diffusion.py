@@ -50,6 +50,20 @@ def test_skip_algebra() -> None:
     assert plain.x0(noise, x_t, t) is noise
 
 
+def test_skip_is_the_best_linear_guess_for_data_of_any_spread() -> None:
+    spread = torch.tensor([0.1, 0.5, 1.0])
+    diffusion, generator = Diffusion(spread=spread), torch.Generator().manual_seed(0)
+    x0 = spread * torch.randn(20_000, 3, generator=generator)
+    noise = torch.randn(x0.shape, generator=generator)
+    for t in (20, 250, 450):
+        x_t = diffusion.add_noise(x0, torch.tensor(t), noise)
+        guess = diffusion.x0(torch.zeros_like(x_t), x_t, torch.tensor(t))
+        slope = (x0 * x_t).mean(0) / (x_t**2).mean(0)
+        torch.testing.assert_close(guess[0] / x_t[0], slope, atol=0.02, rtol=0)
+        gain = diffusion.x0(torch.ones_like(x_t), torch.zeros_like(x_t), torch.tensor(t))[0]
+        torch.testing.assert_close((x0 - guess).std(0), gain, atol=0, rtol=0.03)
+
+
 @pytest.mark.parametrize("rule", RULES)
 def test_a_perfect_prediction_is_reached_and_every_step_visited(rule: Rule) -> None:
     target, seen = torch.full((4, 2, 3), 0.7), []
