@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,21 @@ from tracker.track import F64
 ROUNDS = 4  # of fixing what passes a bound
 GIVE_UP = 1e6  # damping at which no step can help
 CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
+
+
+class FrameEnergy(Protocol):
+    """The energy of n frames that `solve_frames` minimizes."""
+
+    def select(self, frames: slice) -> Self:
+        """That of some of the frames."""
+
+    def value(self, shape: F64, x: F64) -> F64:
+        """[n] at x [n, P] of the subject with landmarks `shape` [L, 3] at rest."""
+
+    def linearize(self, shape: F64, x: F64) -> Quadratic:
+        """Gauss-Newton model at x [n, P]."""
+
+
 Progress = Callable[[int, int], None]
 Step = tuple[F64, F64]  # of the identity [Ki] and of the frames [n, P]
 
@@ -169,7 +185,7 @@ class Smoothness:
 
 
 def solve_frames(
-    energy: Energy,
+    energy: FrameEnergy,
     shape: F64,
     x: F64,
     smoothness: Smoothness,
@@ -215,7 +231,7 @@ def _chunks(n: int) -> list[slice]:
     return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
 
 
-def _linearize(energy: Energy, shape: F64, x: F64) -> tuple[F64, F64]:
+def _linearize(energy: FrameEnergy, shape: F64, x: F64) -> tuple[F64, F64]:
     gradient, hessian = np.empty(x.shape), np.empty((*x.shape, x.shape[1]))
     for part in _chunks(len(x)):
         quadratic = energy.select(part).linearize(shape, x[part])
