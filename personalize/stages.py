@@ -180,7 +180,7 @@ class ReadTracked(Stage):
 class Overlay(Stage):
     """The track over the video, to check by eye."""
 
-    name, version = "overlay", 2
+    name, version, reads = "overlay", 3, ("overlay",)
     needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", "refine/track.npz")
     makes, products = ("contact_sheet.png", "preview.mp4"), ("overlay.mp4",)
 
@@ -188,7 +188,8 @@ class Overlay(Stage):
         return head_assets(settings)
 
     def make(self, context: Context, folder: Path) -> None:
-        write_overlay(context.run, run_head(context.settings), folder, context.report.progress)
+        settings = context.settings
+        write_overlay(context.run, run_head(settings), settings.overlay, folder, context.report.progress)
 
 
 class Registration(Stage):
@@ -227,7 +228,7 @@ class Finetune(Stage):
 class Evaluate(Stage):
     """Metrics on the test split, one clip beside its reference, the report."""
 
-    name, folder, version, reads = "evaluate", "evaluation", 1, ("seed",)
+    name, folder, version, reads = "evaluate", "evaluation", 1, ("seed", "overlay")
     needs = (
         *(VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv"),
         *("overlay/preview.mp4", "overlay/contact_sheet.png", "refine/track.npz"),
@@ -239,4 +240,4 @@ class Evaluate(Stage):
 
     def make(self, context: Context, folder: Path) -> None:
         evaluation = evaluate_run(context.run, context.settings, folder, context.report)
-        write_report(context.run, evaluation, folder)
+        write_report(context.run, evaluation, context.settings.overlay, folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from personalize.files import write_text
 from personalize.overlay import PREVIEW_S
 from personalize.quality import frame_reason
 from personalize.run import RunFolder, read_camera, read_frames, read_track, tool_version
+from tracker.overlay import MODES
 
 # Metric of metrics.json -> name and meaning in the table.
 COLUMNS = {
@@ -30,8 +32,8 @@ COLUMNS = {
 }
 
 
-def write_report(run: RunFolder, evaluation: Evaluation, folder: Path) -> None:
-    """Write `folder`/report.html from the run's files and the evaluation."""
+def write_report(run: RunFolder, evaluation: Evaluation, modes: Sequence[str], folder: Path) -> None:
+    """Write `folder`/report.html from the run's files and the evaluation. modes: those of the overlay."""
     track = read_track(run.path / "refine/track.npz")
     frames = read_frames(run.path / "ingest/frames.npz")
     guidance = run.read_json("finetune/guidance.json")
@@ -49,6 +51,7 @@ def write_report(run: RunFolder, evaluation: Evaluation, folder: Path) -> None:
         warnings=media["warnings"],
         cards=_cards(metrics["systems"], duration, float(track.valid.mean())),
         overlay=_data_url(run.path / "overlay/preview.mp4", "video/mp4"),
+        modes=[{"name": mode, "meaning": MODES[mode]} for mode in modes],
         overlay_cut=round(PREVIEW_S) if duration > PREVIEW_S else 0,
         timeline=charts.timeline(track.time, track.confidence, track.valid),
         reasons=", ".join(f"{reasons.count(name)} {name}" for name in sorted(set(reasons))),
