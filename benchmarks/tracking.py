@@ -1,37 +1,28 @@
-"""Speed and accuracy of the fit, by landmarks alone and refined: `python -m benchmarks.tracking [VIDEO ...]`.
+"""Speed and accuracy of the landmark fit: `python -m benchmarks.tracking [VIDEO ...]`.
 
-Four tables: motion of the embedded head itself under noise (truth known, inside the model, landmarks alone),
-rendered heads that the model does not contain (the project's own, and shared data when it is there), and the
-videos named, where only consistency can be told.
+Three tables: motion of the embedded head itself under noise (truth known, and inside the model), rendered
+heads that the model does not contain (shared data, when it is there), and the videos named, where only
+consistency can be told.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
-from kornia.geometry import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from benchmarks.ground_truth import GroundTruth, compare
 from personalize.media import read_frames
-from personalize.talkers.film import ASSETS, demo_identity, render_talker
-from personalize.talkers.motion import talker_motion
-from personalize.talkers.style import Style
-from personalize.talkers.visemes import load_phones
 from tracker.energy import rotation_matrix
 from tracker.fit import fit_track
 from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, LEFT_EYE_OUTER, POINTS, RIGHT_EYE_OUTER
 from tracker.landmarker import track_landmarks
-from tracker.refine import refine_track
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
 
 FPS, SIZE, FOCAL, DISTANCE_M = 25.0, (1280, 720), 1500.0, 0.65
@@ -46,21 +37,6 @@ SPEECH = (  # shapes, largest weight, Hz
     (("eyeBlinkLeft", "eyeBlinkRight"), 0.8, 0.3),
 )
 CUT = 40.0  # mean grey levels by which the picture changes at a cut
-BENT_MM, UNEVEN = (
-    1.5,
-    0.25,
-)  # of the heads that the model does not contain: mean shift, share of a shape's reach
-JUDGED = (
-    *(
-        "opening_r",
-        "opening_rmse_mm",
-        "opening_centred_mm",
-        "lip_motion_mm",
-        "lip_in_plane_mm",
-        "lip_depth_mm",
-    ),
-    *("lip_offset_mm", "jitter_mm", "rotation_deg", "surface_mm"),
-)
 EMPTY = np.zeros((0, 3), np.float32)
 NO_BUNDLE = Bundle(np.zeros(0, np.int32), EMPTY, EMPTY, EMPTY, np.zeros((0, 4), np.float32))
 
@@ -139,75 +115,10 @@ def rendered(head: HeadModel, folder: Path) -> None:
     print("\nrendered heads outside the model (shared data), focal 1.2 times the long side and the true one")
     for path in sorted(folder.glob("*.npz")):
         truth = GroundTruth.load(path)
-        film = path.with_suffix(".mp4")
-        landmarks, segment = detected(film)
+        landmarks, segment = detected(path.with_suffix(".mp4"))
         for name, focal in (("1.2", 1.2 * max(landmarks.size)), ("true", truth.focal)):
-            before_and_after(f"{path.stem} f={name}", film, landmarks, segment, focal, head, truth)
-
-
-def own_films(head: HeadModel, frames: int = 200) -> None:
-    """Films of the embedded head bent out of its own space, at the true focal length."""
-    print("\nown rendered heads, bent by smooth fields that the model does not contain, true focal")
-    for seed in range(2):
-        with tempfile.TemporaryDirectory() as folder:
-            film = Path(folder) / "talker.mp4"
-            truth = filmed(film, head, seed, frames)
-            landmarks, segment = detected(film)
-            before_and_after(f"own {seed}", film, landmarks, segment, truth.focal, head, truth)
-
-
-def filmed(path: Path, head: HeadModel, seed: int, frames: int) -> GroundTruth:
-    """Render a talker whose neutral is off the model by BENT_MM and whose shapes reach UNEVEN further or less far."""
-    rng = np.random.default_rng((seed, 9))
-    places = head.template.astype(np.float64)
-    waves = np.sin(places @ rng.normal(size=(3, 12)) / 0.04 + rng.uniform(0, 6, 12)) @ rng.normal(
-        size=(12, 3)
-    )
-    bent = (places + 1e-3 * BENT_MM * waves / np.linalg.norm(waves, axis=1).mean()).astype(np.float32)
-    reach = 1 + UNEVEN * np.sin(places @ rng.normal(size=(3, 1)) / 0.04 + rng.uniform(0, 6))
-    other = replace(head, template=bent, expression_basis=head.expression_basis * reach.astype(np.float32))
-    motion = talker_motion(
-        load_phones(ASSETS / "demo_speech.json"), frames / FPS, FPS, seed, Style.random(seed)
-    )
-    identity = demo_identity(head, seed)
-    film = render_talker(path, motion, identity, other, (512, 512), 800.0, seed)
-    face = np.sort(head.regions["face"])
-    weights, count = np.asarray(film.expression, np.float64), len(film.time)
-    return GroundTruth(
-        neutral=film.neutral[face].astype(np.float64),
-        faces=np.searchsorted(face, head.faces[np.isin(head.faces, face).all(1)]).astype(np.int32),
-        displacement=np.tensordot(weights, other.expression_basis[:, face].astype(np.float64), axes=1),
-        rotation=axis_angle_to_rotation_matrix(torch.from_numpy(film.rotation.astype(np.float64))).numpy(),
-        translation=film.translation[:count].astype(np.float64),
-        focal=float(film.focal),
-        lip_gap_mm=film.lip_gap_mm.astype(np.float64),
-    )
-
-
-def before_and_after(
-    name: str,
-    film: Path,
-    landmarks: Landmarks,
-    segment: NDArray[np.int32],
-    focal: float,
-    head: HeadModel,
-    truth: GroundTruth,
-) -> None:
-    """Three lines: landmarks alone, refined, and the change in % (of 1 - r for the correlation)."""
-    track, spent = fitted(landmarks, focal, head, segment)
-    start = time.perf_counter()
-    refined = refine_track(
-        track, landmarks, camera(landmarks.size, focal), head, segment, lambda: read_frames(film)
-    )
-    took = 1e3 * (time.perf_counter() - start) / len(landmarks.time)
-    before, after = compare(track, head, truth), compare(refined.track, head, truth)
-    show(f"{name} landmarks", before | {"ms_per_frame": spent})
-    show(f"{name} refined", after | {"ms_per_frame": took})
-    lost = {key: 1 - value if key == "opening_r" else value for key, value in before.items()}
-    change = {
-        key: 100 * ((1 - after[key] if key == "opening_r" else after[key]) / lost[key] - 1) for key in JUDGED
-    }
-    show(f"{name} change %", change)
+            track, spent = fitted(landmarks, focal, head, segment)
+            show(f"{path.stem} f={name}", compare(track, head, truth) | {"ms_per_frame": spent})
 
 
 def real(head: HeadModel, videos: list[Path], seconds: float) -> None:
@@ -259,7 +170,6 @@ def main() -> None:
     """Print the tables."""
     head = load_head()
     in_model(head)
-    own_films(head)
     shared = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[2] / "shared"))
     if (shared / "data" / "gt").is_dir():
         rendered(head, shared / "data" / "gt")

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from tracker.energy import LandmarkModel
+from tracker.modes import movements
 from tracker.raster import project, rasterize, vertex_normals
 from tracker.track import F32, F64
 
@@ -18,14 +20,8 @@ if TYPE_CHECKING:
 Bool = NDArray[np.bool_]
 
 POINTS = 3000
-INSIDE = (
-    "mouth",
-    "teeth",
-    "tongue",
-    "eyes",
-    "eyelids",
-)  # regions that are no skin, or that turn out of sight
-MOUTH_SHARE = 0.2  # of jawOpen's largest motion: skin that moves by more belongs to the mouth
+INSIDE = ("mouth", "teeth", "tongue", "eyes", "eyelids")  # regions that are no skin, or turn out of sight
+MOUTH_M = 0.015  # from the lips: skin that belongs to the mouth
 COARSE = 0.4  # of the picture's size is enough for the raster that tells what hides what
 MARGIN_M = 0.004  # how far behind the raster's surface skin may lie and still be seen
 FACING = 0.25  # cosine to the line of sight below which skin is too oblique to compare
@@ -39,8 +35,8 @@ OUTLIER = 4.0  # median deviations beyond which a grey level hardly tells the al
 class Skin:
     """P points on one subject's skin, in the solver's head frame (centred on the landmarks).
 
-    triangles: [P] of the head's faces. barycentric: [P, 3]. rest: [P, 3] m. expression: [P, 3, Ke] m, the columns of
-    LandmarkModel. mouth: [P], what moves with the jaw.
+    triangles: [P] of the head's faces. barycentric: [P, 3]. rest: [P, 3] m. expression: [P, 3, K] m, the modes of
+    LandmarkModel. mouth: [P], on the lips and around them.
     """
 
     triangles: NDArray[np.int64]
@@ -61,15 +57,15 @@ def skin_of(head: HeadModel, model: LandmarkModel, identity: F32) -> Skin:
     neutral = head.vertices(identity, np.zeros(len(head.expression_basis), np.float32))
     chosen, share = _spread(neutral[head.faces[triangles]])
     corners = head.faces[triangles[chosen]]
-    expression = np.einsum("pc,kpcx->pxk", share, head.expression_basis[:, corners])
-    expression[..., model.close] += expression[..., model.open]
-    opening = np.linalg.norm(expression[..., model.open], axis=1)
+    points = np.einsum("pc,pcx->px", share, neutral[corners])
+    moves = np.einsum("pc,kpcx->pxk", share, movements(head)[:, corners])
+    distance, _ = cKDTree(neutral[head.regions["lips"]]).query(points)
     return Skin(
         triangles=triangles[chosen],
         barycentric=share,
-        rest=np.einsum("pc,pcx->px", share, neutral[corners]) - model.centre,
-        expression=np.ascontiguousarray(expression, np.float32),
-        mouth=opening > MOUTH_SHARE * opening.max(),
+        rest=points - model.centre,
+        expression=np.ascontiguousarray(moves @ model.modes.to_head.T, np.float32),
+        mouth=distance < MOUTH_M,
     )
 
 

@@ -93,12 +93,6 @@ class LandmarkModel:
         """Number of modes."""
         return len(self.modes)
 
-    def unknowns(self, weights: F64) -> F64:
-        """[.., Ke] the inverse of `arkit`."""
-        out = weights.copy()
-        out[..., self.open] -= weights[..., self.close]
-        return np.clip(out, 0.0, 1.0)
-
 
 def landmark_model(head: HeadModel, weights: Weights) -> LandmarkModel:
     """The head at the landmarks that the fit uses. Raises TrackError for named shapes without ARKit's jaw."""

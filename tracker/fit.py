@@ -198,8 +198,8 @@ def resume(
         visible=visibility(model, rotation, translation),
         strictness=np.ones(len(good)),
     )
-    expression = model.unknowns(track.expression[good].astype(np.float64))
-    return energy, np.concatenate([expression, rotation, translation], axis=1), observed, good
+    moved = track.expression[good].astype(np.float64), track.jaw[good].astype(np.float64)
+    return energy, np.concatenate([model.modes.of_head(*moved), rotation, translation], axis=1), observed, good
 
 
 def make_track(

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from tracker.appearance import Skin
-from tracker.energy import POSE, Energy, Quadratic, left_jacobian, rotation_matrix
+from tracker.energy import POSE, Energy, LandmarkModel, Quadratic, left_jacobian, rotation_matrix
 from tracker.track import F32, F64
 from tracker.view import Rows, View
 
@@ -33,6 +33,11 @@ class PhotometricEnergy:
 
     def __len__(self) -> int:
         return len(self.expected)
+
+    @property
+    def model(self) -> LandmarkModel:
+        """The head at the landmarks."""
+        return self.landmarks.model
 
     def select(self, frames: Rows) -> PhotometricEnergy:
         """The energy of some of the frames."""

@@ -91,8 +91,9 @@ class Subject:
         model, window, matrix = self.energy.model, self.window, rotation_matrix(x[:, -6:-3])
         seen = np.zeros((len(rows), len(self.skin)), np.float32)
         normals = np.zeros((*seen.shape, 3), np.float32)
-        for n, (row, weights) in enumerate(zip(rows, model.arkit(x[:, :-POSE]))):
-            face = self.head.vertices(self.identity, weights) - model.centre
+        moved = (part.astype(np.float32) for part in model.modes.head_weights(x[:, :-POSE]))
+        for n, (row, expression, jaw) in enumerate(zip(rows, *moved)):
+            face = self.head.vertices(self.identity, expression, jaw=jaw) - model.centre
             camera = (face @ matrix[n].T + x[n, -3:]).astype(np.float32)
             principal = window.principal(self.energy.principal, row)
             focal = self.energy.focal * window.scale

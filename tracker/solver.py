@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from tracker.energy import POSE, Energy, Quadratic
+from tracker.energy import POSE, Energy, LandmarkModel, Quadratic
 from tracker.track import F64
 
 ROUNDS = 4  # of fixing what passes a bound
@@ -21,6 +21,10 @@ CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
 
 class FrameEnergy(Protocol):
     """The energy of n frames that `solve_frames` minimizes."""
+
+    @property
+    def model(self) -> LandmarkModel:
+        """The head, whose modes have bounds."""
 
     def select(self, frames: slice) -> Self:
         """That of some of the frames."""
@@ -223,7 +227,7 @@ def solve_frames(
     return x, value
 
 
-def _bounds(energy: Energy) -> Bounds:
+def _bounds(energy: FrameEnergy) -> Bounds:
     return Bounds(energy.model.modes.lower, energy.model.modes.upper)
 
 
