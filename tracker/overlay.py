@@ -28,7 +28,7 @@ EDGES, LIPS, LIDS = (120, 220, 255), (255, 60, 60), (255, 225, 60)
 DETECTED, FITTED = (70, 235, 90), (255, 60, 60)
 WHITE = (240, 240, 240)
 SUBPIXEL = 4  # bits: a sixteenth of a pixel, so that a wrong half pixel would be seen
-LARGEST_ERROR = 32  # grey levels, at the upper end of the colours
+LARGEST_ERROR = 40  # grey levels, at the upper end of the colours
 DIM = 0.45  # of the picture's own brightness, where there is no error to be told
 
 

@@ -13,7 +13,6 @@ from personalize.media import read_frames
 from personalize.quality import frame_reason
 from personalize.run import RunFolder, read_landmarks, read_track
 from personalize.run import read_frames as read_frame_table
-from personalize.shots import Frames
 from tracker.albedo import Albedo, learn_albedo
 from tracker.head import HeadModel
 from tracker.overlay import NEEDS_ALBEDO, draw_modes, letter
@@ -35,11 +34,14 @@ U8 = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class TrackPictures:
-    """Draws any frame of a run: its track, in which modes, on which part of the picture."""
+    """Draws any frame of a run: its track, in which modes, on which part of the picture.
+
+    reasons: [T] why each frame is left out, `ok` where it is not.
+    """
 
     track: Track
     landmarks: Landmarks
-    table: Frames
+    reasons: Sequence[str]
     head: HeadModel
     modes: Sequence[str]
     crop: Crop
@@ -51,6 +53,7 @@ class TrackPictures:
         track = read_track(run.path / "refine/track.npz")
         landmarks = read_landmarks(run.path / "landmarks/landmarks.npz")
         table = read_frame_table(run.path / "ingest/frames.npz")
+        reasons = [frame_reason(table, track, frame) for frame in range(len(track.time))]
         valid = np.flatnonzero(track.valid)
         crop = around_face(landmarks.points[valid, :, :2], landmarks.size)
         albedo = None
@@ -61,7 +64,7 @@ class TrackPictures:
                 for frame, (_, rgb) in enumerate(read_frames(run.video))
                 if frame in keys
             )
-        return cls(track, landmarks, table, head, modes, crop, albedo)
+        return cls(track, landmarks, reasons, head, modes, crop, albedo)
 
     @property
     def columns(self) -> int:
@@ -104,8 +107,8 @@ class TrackPictures:
     def _verdict(self, frame: int) -> tuple[str, tuple[int, int, int]]:
         """Confidence, or why the frame is left out, and the colour to say it in."""
         confidence = float(self.track.confidence[frame])
-        if (reason := frame_reason(self.table, self.track, frame)) != "ok":
-            return f"left out: {reason}", BAD
+        if self.reasons[frame] != "ok":
+            return f"left out: {self.reasons[frame]}", BAD
         return f"confidence {confidence:.2f}", GOOD if confidence >= 0.5 else DOUBTFUL
 
     def _footer(self, frame: int) -> U8:
@@ -121,10 +124,11 @@ class TrackPictures:
 
 def around_face(points: NDArray[np.float32], size: tuple[int, int]) -> Crop:
     """The part of pictures of this size in which the face of landmarks [n, 478, 2] px always lies."""
-    low, high = np.nanmin(points, axis=(0, 1)), np.nanmax(points, axis=(0, 1))
-    margin = FACE_MARGIN * np.nanmedian(np.ptp(points, axis=1), axis=0).max()
-    first = np.floor(np.clip(low - margin, 0, np.array(size) - 2)).astype(int)
-    last = np.ceil(np.clip(high + margin, first + 2, size)).astype(int)
+    found = points[np.isfinite(points).any((1, 2))]
+    low, high = np.nanmin(found, axis=1), np.nanmax(found, axis=1)
+    margin = FACE_MARGIN * np.median(high - low, axis=0).max()
+    first = np.floor(np.clip(low.min(0) - margin, 0, np.array(size) - 2)).astype(int)
+    last = np.ceil(np.clip(high.max(0) + margin, first + 2, size)).astype(int)
     width, height = (last - first).tolist()
     scale = PANEL / max(width, height)
     # Even, so that the film's half is whole pixels.

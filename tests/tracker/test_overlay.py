@@ -3,16 +3,15 @@
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
+from tests.tracker.turning_head import SIZE, picture, shifted_landmarks, turning_track
 from tracker.albedo import Rendering, learn_albedo, rerender
 from tracker.head import HeadModel, load_head
 from tracker.overlay import DETECTED, FITTED, MODES, NEEDS_ALBEDO, draw
-from tracker.raster import render
-from tracker.scene import OUTSIDE, Crop, Scene, place, scene
+from tracker.scene import OUTSIDE, Crop, Scene, scene
 from tracker.track import Landmarks, Track
 
-SIZE, FOCAL, FRAMES = (360, 300), 700.0, 6
+FRAMES, SHIFT = 6, 6.0
 WHOLE = Crop((0, 0), SIZE, SIZE)
 
 
@@ -23,53 +22,17 @@ def head() -> HeadModel:
 
 @pytest.fixture(scope="module")
 def track(head: HeadModel) -> Track:
-    """A head that turns a little from frame to frame and opens its mouth."""
-    turn = Rotation.from_euler("y", np.linspace(-12, 12, FRAMES)[:, None], degrees=True)
-    expression = np.zeros((FRAMES, len(head.expression_names)), np.float32)
-    expression[:, head.expression_names.index("jawOpen")] = np.linspace(0, 0.4, FRAMES)
-    still = np.zeros((FRAMES, 3), np.float32)
-    facing = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
-    return Track(
-        time=np.arange(FRAMES) / 25,
-        valid=np.ones(FRAMES, bool),
-        confidence=np.ones(FRAMES, np.float32),
-        identity=np.zeros(len(head.identity_basis), np.float32),
-        expression=expression,
-        jaw=still,
-        neck=still,
-        eyes=np.zeros((FRAMES, 2, 3), np.float32),
-        rotation=(turn * facing).as_rotvec().astype(np.float32),
-        translation=np.tile(np.array([0, 0, 0.75], np.float32), (FRAMES, 1)),
-        focal=FOCAL,
-        principal=np.array([179.5, 149.5], np.float32),
-        distortion=np.zeros(0, np.float32),
-        size=SIZE,
-        head=head.name,
-        lip_gap_mm=np.zeros(FRAMES, np.float32),
-        reprojection_px=np.zeros(FRAMES, np.float32),
-    )
+    return turning_track(head, FRAMES)
 
 
 @pytest.fixture(scope="module")
 def landmarks(track: Track, head: HeadModel) -> Landmarks:
-    """Detected points 6 px to the right of the fitted ones."""
-    points = np.full((FRAMES, 478, 3), np.nan, np.float32)
-    for frame in range(FRAMES):
-        at = place(track, frame, head)[1]
-        points[frame, head.landmark_embedding.landmarks, :2] = (
-            FOCAL * at[:, :2] / at[:, 2:] + track.principal + (6, 0)
-        )
-    return Landmarks(track.time, points, track.confidence, np.zeros((FRAMES, 52), np.float32), (), SIZE)
-
-
-def film(track: Track, head: HeadModel, frame: int) -> np.ndarray:
-    vertices, _ = place(track, frame, head)
-    return render(vertices, head.faces, head.albedo, FOCAL, tuple(track.principal.tolist()), SIZE)
+    return shifted_landmarks(track, head, SHIFT)
 
 
 @pytest.fixture(scope="module")
 def scenes(track: Track, landmarks: Landmarks, head: HeadModel) -> list[Scene]:
-    return [scene(film(track, head, n), WHOLE, track, n, landmarks, head) for n in range(FRAMES)]
+    return [scene(picture(track, head, n), WHOLE, track, n, landmarks, head) for n in range(FRAMES)]
 
 
 def test_a_crop_maps_points_as_it_maps_the_picture() -> None:
@@ -128,7 +91,7 @@ def test_the_rendering_comes_near_the_picture_and_less_so_at_a_wrong_pose(
         return float(difference.mean())
 
     right = [error(one) for one in scenes]
-    wrong = scene(film(track, head, 1), WHOLE, track, 4, landmarks, head)
+    wrong = scene(picture(track, head, 1), WHOLE, track, 4, landmarks, head)
     assert max(right) < 4
     assert error(wrong) > 2 * max(right)
 
@@ -154,11 +117,11 @@ def test_detected_and_fitted_landmarks_are_both_seen(scenes: list[Scene], head: 
         x, y = np.round(at).astype(int)
         near = drawn[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3).astype(int)
         assert np.abs(near - colour).sum(1).min() < 120
-    assert one.detected[cheek, 0] - one.fitted[cheek, 0] == pytest.approx(6, abs=1e-3)
+    assert one.detected[cheek, 0] - one.fitted[cheek, 0] == pytest.approx(SHIFT, abs=1e-3)
 
 
 def test_a_face_outside_of_the_part_shown_leaves_it_as_it_is(
     track: Track, landmarks: Landmarks, head: HeadModel
 ) -> None:
-    away = scene(film(track, head, 0), Crop((0, 0), (40, 40), (80, 80)), track, 0, landmarks, head)
+    away = scene(picture(track, head, 0), Crop((0, 0), (40, 40), (80, 80)), track, 0, landmarks, head)
     assert (draw(away, "shaded", head, None) == away.picture).all()
