@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.appearance import FACING, MARGIN_M, appearance, frame_light, harmonics, shaded
+from tracker.appearance import MARGIN_M, appearance, frame_light, harmonics, shaded
 from tracker.raster import interpolate, vertex_normals
 from tracker.scene import U8, Scene
 from tracker.track import F32, F64
@@ -17,7 +17,8 @@ from tracker.track import F32, F64
 Bool = NDArray[np.bool_]
 
 BLUR_M = 0.0012  # standard deviation: what vertices a few mm apart can tell
-TIMES_SEEN = 2  # a vertex seen less often has no albedo
+FACING = 0.4  # cosine to the line of sight below which the blur brings in what is behind the face
+TIMES_SEEN = 3  # a vertex seen in fewer of the frames has no albedo
 OUTLIER = 12.0  # grey levels beyond which a vertex hardly tells the light: it is covered
 
 
