@@ -105,11 +105,12 @@ class TrackPictures:
         return draw_modes(seen, modes, self.head, self.albedo)
 
     def _verdict(self, frame: int) -> tuple[str, tuple[int, int, int]]:
-        """Confidence, or why the frame is left out, and the colour to say it in."""
-        confidence = float(self.track.confidence[frame])
-        if self.reasons[frame] != "ok":
-            return f"left out: {self.reasons[frame]}", BAD
-        return f"confidence {confidence:.2f}", GOOD if confidence >= 0.5 else DOUBTFUL
+        """Confidence, why the frame is left out if it is, and the colour to say it in."""
+        confidence, reason = float(self.track.confidence[frame]), self.reasons[frame]
+        said = f"confidence {confidence:.2f}"
+        if reason != "ok":
+            return f"{said}, left out: {reason}", BAD
+        return said, GOOD if confidence >= 0.5 else DOUBTFUL
 
     def _footer(self, frame: int) -> U8:
         """[FOOTER, W, 3]: a bar as long as the confidence, the time, and the verdict."""
