@@ -39,6 +39,13 @@ def run(
             help="Result folder of metrical-tracker or VHAP to use instead of tracking; with --head."
         ),
     ] = None,
+    overlay: Annotated[
+        str,
+        typer.Option(
+            metavar="MODE[,MODE...]",
+            help="What the overlay film shows beside the video: shaded, wireframe, albedo, error, landmarks.",
+        ),
+    ] = ",".join(Settings.overlay),
     until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
     from_: Annotated[
         str | None, typer.Option("--from", metavar="STAGE", help="Make again from here on.")
@@ -59,6 +66,7 @@ def run(
         head=_text(head),
         head_embedding=_text(head_embedding),
         tracked=_text(tracked),
+        overlay=tuple(overlay.split(",")),
     )
     result = personalize_video(video, out, settings, first=from_, until=until, force=force)
     if json_:

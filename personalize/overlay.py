@@ -2,61 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from personalize.errors import UserError
 from personalize.files import write_atomic
 from personalize.media import VideoWriter, on_video_clock, read_audio, read_frames
-from personalize.quality import frame_reason
-from personalize.render.text import caption
-from personalize.run import RunFolder, read_landmarks, read_track
-from personalize.run import read_frames as read_frame_table
+from personalize.render.track import TrackPictures, grid
+from personalize.run import RunFolder
 from tracker.head import HeadModel
-from tracker.overlay import contact_sheet, draw_overlay, panel_size
+from tracker.overlay import MODES
 
-PREVIEW_WIDTH, PREVIEW_CRF, PREVIEW_S = 720, 30, 60.0
-WORST, SPREAD = 8, 8
-TILE, FACE_MARGIN = 480, 1.5  # px; of the face's own extent
+CRF, PRESET = 22, "superfast"  # half of the time goes into encoding
+PREVIEW_CRF, PREVIEW_S = 30, 60.0
+WORST, SPREAD, COLUMNS = 8, 8, 4
 AUDIO_RATE = 48_000
 
-U8 = NDArray[np.uint8]
+
+def check_modes(modes: Sequence[str]) -> None:
+    """Raises UserError when one of the modes does not exist."""
+    for mode in modes:
+        if mode not in MODES:
+            raise UserError(f"--overlay {mode}: no such mode; give one or more of {','.join(MODES)}")
 
 
 def write_overlay(
-    run: RunFolder, head: HeadModel, folder: Path, progress: Callable[[int, int], None]
+    run: RunFolder, head: HeadModel, modes: Sequence[str], folder: Path, progress: Callable[[int, int], None]
 ) -> None:
-    """Write overlay.mp4 with the original sound, preview.mp4 for the report, and contact_sheet.png."""
-    track = read_track(run.path / "refine/track.npz")
-    landmarks = read_landmarks(run.path / "landmarks/landmarks.npz")
-    table = read_frame_table(run.path / "ingest/frames.npz")
-    total = len(track.time)
-    shown = set(notable_frames(track.valid, track.confidence).tolist())
-    kept: dict[int, U8] = {}
-    fps = (total - 1) / float(track.time[-1]) if total > 1 else 25.0
-    width, height = panel_size(landmarks.size)
-    small = (PREVIEW_WIDTH, round(PREVIEW_WIDTH * height / (2 * width) / 2) * 2)
-    sound = on_video_clock(*read_audio(run.video, AUDIO_RATE), float(track.time[-1]) + 1 / fps, AUDIO_RATE)
-    preview_sound = sound[: round(PREVIEW_S * AUDIO_RATE)]
+    """Write overlay.mp4 with the original sound, preview.mp4 for the report, and contact_sheet.png.
+
+    modes: of tracker.overlay.MODES, each a picture beside the video; the contact sheet shows the first.
+    """
+    pictures = TrackPictures.of(run, head, modes)
+    track, size = pictures.track, pictures.size
+    half = (size[0] // 2, size[1] // 2)
+    total, end = len(track.time), float(track.time[-1])
+    fps = (total - 1) / end if total > 1 else 25.0
+    sound = on_video_clock(*read_audio(run.video, AUDIO_RATE), end + 1 / fps, AUDIO_RATE)
+    start = sound[: round(PREVIEW_S * AUDIO_RATE)]
+    notable = notable_frames(track.valid, track.confidence).tolist()
+    tiles = {}
     with (
-        VideoWriter(folder / "overlay.mp4", fps, (2 * width, height), sound, AUDIO_RATE) as film,
-        VideoWriter(folder / "preview.mp4", fps, small, preview_sound, AUDIO_RATE, PREVIEW_CRF) as preview,
+        VideoWriter(folder / "overlay.mp4", fps, size, sound, AUDIO_RATE, CRF, PRESET) as film,
+        VideoWriter(folder / "preview.mp4", fps, half, start, AUDIO_RATE, PREVIEW_CRF, PRESET) as preview,
     ):
         for frame, (time, rgb) in enumerate(read_frames(run.video)):
-            picture = draw_overlay(rgb, track, frame, landmarks, head, frame_reason(table, track, frame))
+            picture = pictures.film(rgb, frame)
             film.write(picture, time)
             if time < PREVIEW_S:
-                preview.write(cv2.resize(picture, small, interpolation=cv2.INTER_AREA), time)
-            if frame in shown:
-                scale = height / rgb.shape[0]
-                tile = _around_face(picture[:, width:], landmarks.points[frame, :, :2] * scale)
-                kept[frame] = caption(tile, f"{time:.2f} s, confidence {track.confidence[frame]:.2f}")
+                preview.write(cv2.resize(picture, half, interpolation=cv2.INTER_AREA), time)
+            if frame in notable:
+                tiles[frame] = pictures.tile(rgb, frame)
             progress(frame + 1, total)
-    sheet = contact_sheet([kept[frame] for frame in notable_frames(track.valid, track.confidence)])
-    _, png = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
+    sheet = cv2.cvtColor(grid([tiles[frame] for frame in notable], COLUMNS), cv2.COLOR_RGB2BGR)
+    _, png = cv2.imencode(".png", sheet)
     write_atomic(folder / "contact_sheet.png", lambda stream: stream.write(png.tobytes()))
 
 
@@ -72,14 +75,3 @@ def notable_frames(valid: NDArray[np.bool_], confidence: NDArray[np.float32]) ->
             break
     spread = tracked[np.linspace(0, len(tracked) - 1, SPREAD).round().astype(int)]
     return np.concatenate([np.asarray(worst, np.intp), spread])
-
-
-def _around_face(picture: U8, points: NDArray[np.float32]) -> U8:
-    """A square of the picture around the points [478, 2] px, TILE px a side: on it a wrong mesh can be seen."""
-    low, high = points.min(0), points.max(0)
-    side = float((high - low).max()) * FACE_MARGIN
-    scale = TILE / side
-    window = np.array([[scale, 0, 0], [0, scale, 0]])
-    window[:, 2] = (TILE - 1) / 2 - scale * (low + high) / 2
-    tile: U8 = cv2.warpAffine(picture, window, (TILE, TILE), flags=cv2.INTER_AREA)
-    return tile

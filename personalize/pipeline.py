@@ -9,6 +9,7 @@ from model.training_config import available_device
 from personalize.errors import UserError
 from personalize.heads import run_head
 from personalize.media import probe
+from personalize.overlay import check_modes
 from personalize.reporter import Reporter
 from personalize.run import RunFolder
 from personalize.settings import Settings
@@ -61,6 +62,7 @@ def personalize_video(
     Raises UserError for whatever the user can mend.
     """
     probe(video)
+    check_modes(settings.overlay)
     try:
         # Asked now, not after the tracking.
         available_device(settings.device)

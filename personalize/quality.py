@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from personalize.files import write_text
 from personalize.shots import Frames
+from tracker.refine import Refined
 from tracker.track import Track
 
 COLUMNS = (
@@ -40,8 +41,9 @@ def frame_reason(frames: Frames, track: Track, frame: int) -> str:
     return reason if reason != "ok" else "no_face"
 
 
-def write_quality(path: Path, track: Track, frames: Frames) -> None:
-    """Write the table; `photometric` stays empty where no photometric stage has run."""
+def write_quality(path: Path, refined: Refined, frames: Frames) -> None:
+    """Write the table; `photometric` is 1 for a usual frame of the clip and empty where nothing was compared."""
+    track = refined.track
     stream = io.StringIO()
     table = csv.writer(stream, lineterminator="\n")
     table.writerow(COLUMNS)
@@ -56,7 +58,7 @@ def write_quality(path: Path, track: Track, frames: Frames) -> None:
                 int(track.valid[frame]),
                 f"{track.confidence[frame]:.3f}",
                 f"{track.reprojection_px[frame]:.3f}",
-                "",
+                "" if np.isnan(refined.photometric[frame]) else f"{refined.photometric[frame]:.3f}",
                 f"{track.lip_gap_mm[frame]:.3f}",
                 *(f"{angle:.2f}" for angle in angles[frame]),
                 frame_reason(frames, track, frame),

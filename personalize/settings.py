@@ -18,6 +18,7 @@ class Settings:
     head: FLAME pickle to track with, None for the embedded head.
     head_embedding: its landmark embedding, None for the one that lies beside it.
     tracked: folder of another tracker's result, to be read instead of tracking; it needs `head`.
+    overlay: what the overlay film shows beside the video, of tracker.overlay.MODES.
     """
 
     iterations: int = 30_000
@@ -29,3 +30,4 @@ class Settings:
     head: str | None = None
     head_embedding: str | None = None
     tracked: str | None = None
+    overlay: tuple[str, ...] = ("wireframe",)

@@ -27,6 +27,7 @@ from personalize.tracked import read_track_of
 from tracker.camera import estimate_camera
 from tracker.fit import fit_track
 from tracker.landmarker import track_landmarks
+from tracker.refine import refine_track
 
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
 
@@ -128,16 +129,32 @@ class TrackStage(Stage):
 
 
 class Refine(Stage):
-    """Photometric refinement: for now the landmark track as it is, and quality.csv from what there is."""
+    """The track again, with the grey levels of the skin; quality.csv."""
 
-    name, version = "refine", 1
-    needs, makes = ("ingest/frames.npz", "track/track.npz"), ("track.npz", "quality.csv")
+    name, version = "refine", 2
+    needs = (
+        *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz"),
+        *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),
+    )
+    makes = ("track.npz", "quality.csv")
+
+    def assets(self, settings: Settings) -> dict[str, str]:
+        return {"head": load_head().sha256}
 
     def make(self, context: Context, folder: Path) -> None:
         root = context.run.path
-        track = files.read_track(root / "track/track.npz")
-        files.write_track(folder / "track.npz", track)
-        write_quality(folder / "quality.csv", track, files.read_frames(root / "ingest/frames.npz"))
+        frames = files.read_frames(root / "ingest/frames.npz")
+        refined = refine_track(
+            files.read_track(root / "track/track.npz"),
+            files.read_landmarks(root / "landmarks/landmarks.npz"),
+            files.read_camera(root / "camera")[0],
+            load_head(),
+            frames.segment,
+            lambda: read_frames(context.run.video),
+            context.report.progress,
+        )
+        files.write_track(folder / "track.npz", refined.track)
+        write_quality(folder / "quality.csv", refined, frames)
 
 
 class ReadTracked(Stage):
@@ -163,7 +180,7 @@ class ReadTracked(Stage):
 class Overlay(Stage):
     """The track over the video, to check by eye."""
 
-    name, version = "overlay", 2
+    name, version, reads = "overlay", 3, ("overlay",)
     needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", "refine/track.npz")
     makes, products = ("contact_sheet.png", "preview.mp4"), ("overlay.mp4",)
 
@@ -171,7 +188,8 @@ class Overlay(Stage):
         return head_assets(settings)
 
     def make(self, context: Context, folder: Path) -> None:
-        write_overlay(context.run, run_head(context.settings), folder, context.report.progress)
+        settings = context.settings
+        write_overlay(context.run, run_head(settings), settings.overlay, folder, context.report.progress)
 
 
 class Registration(Stage):
@@ -210,7 +228,7 @@ class Finetune(Stage):
 class Evaluate(Stage):
     """Metrics on the test split, one clip beside its reference, the report."""
 
-    name, folder, version, reads = "evaluate", "evaluation", 1, ("seed",)
+    name, folder, version, reads = "evaluate", "evaluation", 1, ("seed", "overlay")
     needs = (
         *(VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv"),
         *("overlay/preview.mp4", "overlay/contact_sheet.png", "refine/track.npz"),
@@ -222,4 +240,4 @@ class Evaluate(Stage):
 
     def make(self, context: Context, folder: Path) -> None:
         evaluation = evaluate_run(context.run, context.settings, folder, context.report)
-        write_report(context.run, evaluation, folder)
+        write_report(context.run, evaluation, context.settings.overlay, folder)

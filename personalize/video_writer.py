@@ -16,7 +16,7 @@ from personalize.sound import AUDIO_RATE
 _TIME_BASE = Fraction(1, 90_000)
 _BT709 = 1
 # Without B pictures: with them this encoder's bytes differ from run to run, and a remade file would not be the same.
-_X264 = {"preset": "veryfast", "bf": "0"}
+_X264 = {"bf": "0"}
 
 
 class VideoWriter:
@@ -33,10 +33,11 @@ class VideoWriter:
         audio: NDArray[np.float32] | None = None,
         audio_rate: int = AUDIO_RATE,
         crf: int = 20,
+        preset: str = "veryfast",
     ) -> None:
         """fps: nominal rate. size: (width, height) px; an odd side gets one more row or column.
 
-        audio: mono [S] -1..1, its first sample at time 0. crf: quality of x264, lower is better.
+        audio: mono [S] -1..1, its first sample at time 0. crf: quality of x264, lower is better. preset: its speed.
         """
         self._path = path
         self._partial = path.with_name(f".{path.name}.partial")
@@ -45,7 +46,8 @@ class VideoWriter:
         self._count = 0
         self._container = av.open(str(self._partial), "w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(fps).limit_denominator(1001)
-        self._video = self._container.add_stream("libx264", rate=rate, options=_X264 | {"crf": str(crf)})
+        options = _X264 | {"crf": str(crf), "preset": preset}
+        self._video = self._container.add_stream("libx264", rate=rate, options=options)
         self._video.width, self._video.height = size[0] + size[0] % 2, size[1] + size[1] % 2
         self._video.pix_fmt = "yuv420p"
         self._video.codec_context.time_base = _TIME_BASE

@@ -1,132 +1,144 @@
-"""Pictures to check the track by: the frame with the fitted mesh, detected and fitted landmarks, and confidence."""
+"""Pictures to check a track by: ways to draw the fitted face over the picture it was fitted to."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
-from torch import from_numpy
 
+from tracker.albedo import Albedo, Rendering, rerender
 from tracker.head import HeadModel
-from tracker.raster import project, rasterize, shade
-from tracker.track import Landmarks, Track
+from tracker.raster import shade
+from tracker.scene import U8, Scene
 
-U8 = NDArray[np.uint8]
-F32 = NDArray[np.float32]
+MODES = {
+    "shaded": "the fitted surface in clay",
+    "wireframe": "its edges, with the lines where the lips and the lids meet",
+    "albedo": "the face re-rendered: the subject's colours in the light of each frame",
+    "error": "how far that is from the picture, in grey levels",
+    "landmarks": "detected points in green, each joined to its fitted one in red",
+}
+NEEDS_ALBEDO = ("albedo", "error")
 
-MESH_OPACITY = 0.5
+MESH_OPACITY, EDGE_OPACITY = 0.5, 0.5
 CLAY = (196, 178, 168)
-DETECTED, FITTED = (70, 235, 90), (255, 70, 60)
-GOOD, DOUBTFUL, BAD = (70, 200, 90), (245, 180, 40), (230, 60, 50)
-TALLEST, SMALLEST = 1080, 720
+EDGES, LIPS, LIDS = (120, 220, 255), (255, 60, 60), (255, 225, 60)
+DETECTED, FITTED = (70, 235, 90), (255, 60, 60)
+WHITE = (240, 240, 240)
+SUBPIXEL = 4  # bits: a sixteenth of a pixel, so that a wrong half pixel would be seen
+LARGEST_ERROR = 40  # grey levels, at the upper end of the colours
+DIM = 0.45  # of the picture's own brightness, where there is no error to be told
 
 
-@dataclass(frozen=True)
-class Placed:
-    """The fitted head of one frame in the camera frame: vertices [D, 3] m, embedded landmarks [L, 3] m."""
+def draw(scene: Scene, mode: str, head: HeadModel, rendering: Rendering | None) -> U8:
+    """[H, W, 3] u8: the scene's picture with the fitted face over it in one of MODES.
 
-    vertices: F32
-    landmarks: F32
-
-
-def place(track: Track, frame: int, head: HeadModel) -> Placed:
-    """Vertices and embedded landmarks of one frame in the camera frame, m."""
-    posed = {"jaw": track.jaw[frame], "neck": track.neck[frame], "eyes": track.eyes[frame]}
-    rotation = axis_angle_to_rotation_matrix(from_numpy(track.rotation[frame : frame + 1]))[0].numpy()
-    vertices = head.vertices(track.identity, track.expression[frame], **posed)
-    embedding = head.landmark_embedding
-    corners = vertices[head.faces[embedding.triangles]]
-    landmarks = np.einsum("lc,lcx->lx", embedding.barycentric, corners)
-    translation = track.translation[frame]
-    return Placed(vertices @ rotation.T + translation, landmarks @ rotation.T + translation)
-
-
-def panel_size(size: tuple[int, int]) -> tuple[int, int]:
-    """Size of one of the two pictures side by side: the video's own, held between 720 and 1080 px in height."""
-    width, height = size
-    scale = np.clip(height, SMALLEST, TALLEST) / height
-    return round(width * scale / 2) * 2, round(height * scale / 2) * 2
-
-
-def draw_overlay(rgb: U8, track: Track, frame: int, landmarks: Landmarks, head: HeadModel, reason: str) -> U8:
-    """[H, 2W, 3] u8: the frame as it is, and with mesh, landmarks and confidence over it.
-
-    reason: why the frame was left out (`ok` when it was not). Points: green detected, red fitted.
+    rendering: for those that NEEDS_ALBEDO.
     """
-    width, height = panel_size((rgb.shape[1], rgb.shape[0]))
-    scale = height / rgb.shape[0]
-    picture = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA)
-    drawn = picture.copy()
-    if track.valid[frame]:
-        placed = place(track, frame, head)
-        # Pixel centres are at integers: scaling moves them by half a pixel on both sides.
-        principal = (track.principal + 0.5) * scale - 0.5
-        _draw_mesh(drawn, placed.vertices, track.focal * scale, principal, head)
-        detected = (landmarks.points[frame, :, :2] + 0.5) * scale - 0.5
-        fitted = project(placed.landmarks, track.focal * scale, principal)
-        radius = max(1, round(float(np.ptp(detected[:, 0])) / 300))
-        # The detected ones are rings around the fitted: where they agree, both are seen.
-        _draw_points(drawn, detected[head.landmark_embedding.landmarks], DETECTED, radius + 1)
-        _draw_points(drawn, fitted, FITTED, radius)
-    _draw_confidence(drawn, float(track.confidence[frame]), bool(track.valid[frame]), reason)
-    return np.concatenate([picture, drawn], axis=1)
+    if mode == "shaded":
+        return _shaded(scene)
+    if mode == "wireframe":
+        return _wireframe(scene, head)
+    if mode == "landmarks":
+        return _landmarks(scene)
+    assert rendering is not None
+    return _albedo(scene, rendering) if mode == "albedo" else _error(scene, rendering)
 
 
-def _draw_mesh(picture: U8, vertices: F32, focal: float, principal: F32, head: HeadModel) -> None:
-    """Shade the face region into the picture. The skull has no hair and no evidence: it would only mislead."""
-    shown = np.zeros(len(head.template), bool)
-    shown[head.regions["face"]] = True
-    faces = head.faces[shown[head.faces].all(1)]
-    pixels = np.concatenate([project(vertices, focal, principal), vertices[:, 2:]], axis=1)
-    low = np.maximum(np.floor(pixels[shown, :2].min(0)).astype(int), 0)
-    high = np.minimum(np.ceil(pixels[shown, :2].max(0)).astype(int) + 1, picture.shape[1::-1])
-    if (high <= low).any():
-        return
-    window = picture[low[1] : high[1], low[0] : high[0]]
-    pixels[:, :2] -= low
-    raster = rasterize(pixels, faces, (window.shape[1], window.shape[0]))
-    clay = np.tile(np.asarray(CLAY, np.uint8), (len(vertices), 1))
+def draw_modes(scene: Scene, modes: Sequence[str], head: HeadModel, albedo: Albedo | None) -> list[U8]:
+    """One picture [H, W, 3] u8 for each of the modes."""
+    rendering = rerender(scene, albedo) if albedo else None
+    return [draw(scene, mode, head, rendering) for mode in modes]
+
+
+def _shaded(scene: Scene) -> U8:
+    drawn = scene.picture.copy()
+    part = scene.part(drawn)
+    clay = np.tile(np.asarray(CLAY, np.uint8), (len(scene.vertices), 1))
     # Where there is no face the background is the picture itself, so that the mixture leaves it as it is.
-    shaded = shade(raster, faces, vertices, clay, window)
-    window[:] = cv2.addWeighted(shaded, MESH_OPACITY, window, 1 - MESH_OPACITY, 0)
+    shaded = shade(scene.raster, scene.faces, scene.vertices, clay, part)
+    part[:] = cv2.addWeighted(shaded, MESH_OPACITY, part, 1 - MESH_OPACITY, 0)
+    return drawn
 
 
-def _draw_points(picture: U8, points: F32, colour: tuple[int, int, int], radius: int) -> None:
-    # Sixteenths of a pixel, so that a wrong half pixel would be seen.
-    for x, y in np.round(points[np.isfinite(points).all(1)] * 16).astype(int).tolist():
-        cv2.circle(picture, (x, y), radius * 16, colour, -1, cv2.LINE_AA, 4)
+def _wireframe(scene: Scene, head: HeadModel) -> U8:
+    shown = np.zeros(len(scene.faces) + 1, bool)
+    shown[scene.raster.triangle] = True  # -1, where there is no triangle, is the last
+    edges = scene.picture.copy()
+    _lines(edges, scene.pixels[scene.faces[shown[:-1]]], EDGES, closed=True)
+    drawn: U8 = cv2.addWeighted(edges, EDGE_OPACITY, scene.picture, 1 - EDGE_OPACITY, 0)
+    for part, colour in (("inner_lip", LIPS), ("left_eyelid", LIDS), ("right_eyelid", LIDS)):
+        for side in ("upper", "lower"):
+            if (name := f"{part}_{side}") in head.regions:
+                _lines(drawn, scene.pixels[None, head.regions[name]], colour, closed=False)
+    return drawn
 
 
-def _draw_confidence(picture: U8, confidence: float, valid: bool, reason: str) -> None:
+def _albedo(scene: Scene, rendering: Rendering) -> U8:
+    drawn = scene.picture.copy()
+    cv2.copyTo(rendering.colour, rendering.known, scene.part(drawn))
+    return drawn
+
+
+def _error(scene: Scene, rendering: Rendering) -> U8:
+    grey = cv2.cvtColor(scene.picture, cv2.COLOR_RGB2GRAY)
+    drawn: U8 = cv2.cvtColor(cv2.convertScaleAbs(grey, alpha=DIM), cv2.COLOR_GRAY2RGB)
+    error = cv2.cvtColor(cv2.absdiff(rendering.colour, rendering.blurred), cv2.COLOR_RGB2GRAY)
+    heat = _heat(cv2.convertScaleAbs(error, alpha=255 / LARGEST_ERROR))
+    cv2.copyTo(heat, rendering.known, scene.part(drawn))
+    _legend(drawn)
+    return drawn
+
+
+def _landmarks(scene: Scene) -> U8:
+    drawn = scene.picture.copy()
+    pairs = np.stack([scene.fitted, scene.detected], axis=1)
+    pairs = pairs[np.isfinite(pairs).all((1, 2))]
+    extent = float(np.ptp(pairs[..., 0])) if len(pairs) else 0.0
+    radius = max(1.0, extent / 320)
+    _lines(drawn, pairs, FITTED, closed=False)
+    for side, colour, share in ((0, FITTED, 1.0), (1, DETECTED, 0.8)):
+        for x, y in _fine(pairs[:, side]).tolist():
+            cv2.circle(drawn, (x, y), round(share * radius * 2**SUBPIXEL), colour, -1, cv2.LINE_AA, SUBPIXEL)
+    return drawn
+
+
+def _lines(picture: U8, points: NDArray[np.floating], colour: tuple[int, int, int], closed: bool) -> None:
+    """Lines through points [N, n, 2 or more] px."""
+    cv2.polylines(picture, list(_fine(points)), closed, colour, 1, cv2.LINE_AA, SUBPIXEL)
+
+
+def _fine(points: NDArray[np.floating]) -> NDArray[np.int32]:
+    return np.round(points[..., :2] * 2**SUBPIXEL).astype(np.int32)
+
+
+def _heat(level: U8) -> U8:
+    """[.., 3] u8 RGB of levels [h, w] u8."""
+    colours: U8 = cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1]
+    return colours
+
+
+def _legend(picture: U8) -> None:
+    """A bar of the colours with their grey levels in the lower right corner."""
     height, width = picture.shape[:2]
-    colour = BAD if not valid else GOOD if confidence >= 0.5 else DOUBTFUL
-    bar = round(width * confidence)
-    thick = max(4, height // 120)
-    picture[-thick:] = (40, 40, 40)
-    picture[-thick:, :bar] = colour
-    text = f"confidence {confidence:.2f}" if valid else f"left out: {reason}"
-    size = height / 900
-    for shade_of, weight in (((0, 0, 0), 4), (colour, 2)):
-        cv2.putText(
-            picture,
-            text,
-            (12, height - thick - 12),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            size,
-            shade_of,
-            weight,
-            cv2.LINE_AA,
-        )
+    unit = max(1, min(height, width) // 40)
+    bar = _heat(np.tile(np.linspace(0, 255, 8 * unit).astype(np.uint8), (unit, 1)))
+    left, top = width - 10 * unit, height - 3 * unit
+    picture[top : top + unit, left : left + 8 * unit] = bar
+    for share in (0.0, 0.5, 1.0):
+        at = (round(left + (8 * share - 0.4) * unit), top + round(2.2 * unit))
+        letter(picture, f"{share * LARGEST_ERROR:.0f}", at, unit)
 
 
-def contact_sheet(pictures: list[U8], columns: int = 4, tile_width: int = 480) -> U8:
-    """Pictures of one size -> one sheet, row by row."""
-    height, width = pictures[0].shape[:2]
-    tile = (tile_width, round(tile_width * height / width))
-    tiles = [cv2.resize(picture, tile, interpolation=cv2.INTER_AREA) for picture in pictures]
-    tiles += [np.full_like(tiles[0], 30)] * (-len(tiles) % columns)
-    rows = [np.concatenate(tiles[start : start + columns], axis=1) for start in range(0, len(tiles), columns)]
-    return np.concatenate(rows, axis=0)
+def letter(
+    picture: U8, text: str, origin: tuple[int, int], height: int, colour: tuple[int, int, int] = WHITE
+) -> None:
+    """Write a line of text on dark ground into a picture. origin: its lower left corner. height: of capitals, px."""
+    size, weight = height / 21, max(1, round(height / 12))  # capitals of the font are 21 px high at size 1
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, weight)
+    rim = max(2, height // 3)
+    (x, y), black = origin, (0, 0, 0)
+    cv2.rectangle(picture, (x - rim, y - height - rim), (x + width + rim, y + rim), black, -1)
+    cv2.putText(picture, text, origin, cv2.FONT_HERSHEY_SIMPLEX, size, colour, weight, cv2.LINE_AA)

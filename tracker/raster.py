@@ -65,6 +65,14 @@ def vertex_normals(vertices: NDArray[np.floating], faces: NDArray[np.int32]) -> 
     return _normals(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32))
 
 
+def interpolate(raster: Raster, faces: NDArray[np.int32], field: F32) -> F32:
+    """[H, W, C] values of a vertex field [D, C] f32 on the surface that each pixel sees, 0 where there is none."""
+    values = np.zeros((*raster.triangle.shape, field.shape[1]), np.float32)
+    corners = np.ascontiguousarray(faces, np.int32)
+    _spread(raster.triangle, raster.barycentric, corners, np.ascontiguousarray(field, np.float32), values)
+    return values
+
+
 def shade(
     raster: Raster,
     faces: NDArray[np.int32],
@@ -166,6 +174,22 @@ def _normals(vertices, faces):  # type: ignore[no-untyped-def]
         if length > 0:
             normals[i] /= length
     return normals
+
+
+@njit(cache=True)
+def _spread(triangle, barycentric, faces, field, values):  # type: ignore[no-untyped-def]
+    height, width = triangle.shape
+    for y in range(height):
+        for x in range(width):
+            if triangle[y, x] < 0:
+                continue
+            corner = faces[triangle[y, x]]
+            weight = barycentric[y, x]
+            for channel in range(field.shape[1]):
+                value = np.float32(0)
+                for k in range(3):
+                    value += weight[k] * field[corner[k], channel]
+                values[y, x, channel] = value
 
 
 @njit(cache=True)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import base64
 import csv
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -17,6 +19,7 @@ from personalize.files import write_text
 from personalize.overlay import PREVIEW_S
 from personalize.quality import frame_reason
 from personalize.run import RunFolder, read_camera, read_frames, read_track, tool_version
+from tracker.overlay import MODES
 
 # Metric of metrics.json -> name and meaning in the table.
 COLUMNS = {
@@ -30,8 +33,8 @@ COLUMNS = {
 }
 
 
-def write_report(run: RunFolder, evaluation: Evaluation, folder: Path) -> None:
-    """Write `folder`/report.html from the run's files and the evaluation."""
+def write_report(run: RunFolder, evaluation: Evaluation, modes: Sequence[str], folder: Path) -> None:
+    """Write `folder`/report.html from the run's files and the evaluation. modes: those of the overlay."""
     track = read_track(run.path / "refine/track.npz")
     frames = read_frames(run.path / "ingest/frames.npz")
     guidance = run.read_json("finetune/guidance.json")
@@ -49,10 +52,11 @@ def write_report(run: RunFolder, evaluation: Evaluation, folder: Path) -> None:
         warnings=media["warnings"],
         cards=_cards(metrics["systems"], duration, float(track.valid.mean())),
         overlay=_data_url(run.path / "overlay/preview.mp4", "video/mp4"),
+        modes=[{"name": mode, "meaning": MODES[mode]} for mode in modes],
         overlay_cut=round(PREVIEW_S) if duration > PREVIEW_S else 0,
         timeline=charts.timeline(track.time, track.confidence, track.valid),
         reasons=", ".join(f"{reasons.count(name)} {name}" for name in sorted(set(reasons))),
-        contact_sheet=_data_url(run.path / "overlay/contact_sheet.png", "image/png"),
+        contact_sheet=_photograph_url(run.path / "overlay/contact_sheet.png"),
         clip=_data_url(folder / "samples/test.mp4", "video/mp4"),
         lip_opening=charts.lip_opening(evaluation.clip_time, evaluation.reference, evaluation.samples),
         guidance=metrics["guidance"],
@@ -101,4 +105,14 @@ def _facts(run: RunFolder, media: dict[str, Any]) -> list[dict[str, str]]:
 
 
 def _data_url(path: Path, kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+    return _encoded(path.read_bytes(), kind)
+
+
+def _photograph_url(path: Path) -> str:
+    """A picture as JPEG, a tenth of the PNG's size."""
+    _, jpeg = cv2.imencode(".jpg", cv2.imread(str(path)))
+    return _encoded(jpeg.tobytes(), "image/jpeg")
+
+
+def _encoded(content: bytes, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"

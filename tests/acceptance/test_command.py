@@ -62,12 +62,15 @@ def test_wrong_options_get_one_line(tmp_path: Path) -> None:
     assert_refused(personalize(*edit, "--rule", "euler", cwd=tmp_path), "rule")
 
 
-def test_an_encoder_or_device_that_is_not_there_gets_one_line_before_any_work(tmp_path: Path) -> None:
+def test_an_encoder_a_device_or_a_mode_that_is_not_there_gets_one_line_before_any_work(
+    tmp_path: Path,
+) -> None:
     video, speech = tmp_path / "talk.mkv", tmp_path / "speech.wav"
     write_video(video, [corner_picture()] * 10, [0.04 * n for n in range(10)])
     speech.touch()
     assert_refused(personalize("run", video, "--encoder", "nowhere", cwd=tmp_path), "nowhere")
     assert_refused(personalize("run", video, "--device", "abacus", cwd=tmp_path), "abacus", "cpu")
+    assert_refused(personalize("run", video, "--overlay", "shaded,wire", cwd=tmp_path), "wire:", "wireframe")
     subject = ("--subject", BASE_CHECKPOINT)
     assert_refused(personalize("animate", speech, *subject, "--encoder", "nowhere", cwd=tmp_path), "nowhere")
     assert sorted(tmp_path.iterdir()) == [speech, video]

@@ -1,0 +1,127 @@
+"""Overlay modes on a head rendered in known colours: they draw on the face alone, and say how well it fits."""
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.tracker.turning_head import SIZE, picture, shifted_landmarks, turning_track
+from tracker.albedo import Rendering, learn_albedo, rerender
+from tracker.head import HeadModel, load_head
+from tracker.overlay import DETECTED, FITTED, MODES, NEEDS_ALBEDO, draw
+from tracker.scene import OUTSIDE, Crop, Scene, scene
+from tracker.track import Landmarks, Track
+
+FRAMES, SHIFT = 6, 6.0
+WHOLE = Crop((0, 0), SIZE, SIZE)
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return load_head()
+
+
+@pytest.fixture(scope="module")
+def track(head: HeadModel) -> Track:
+    return turning_track(head, FRAMES)
+
+
+@pytest.fixture(scope="module")
+def landmarks(track: Track, head: HeadModel) -> Landmarks:
+    return shifted_landmarks(track, head, SHIFT)
+
+
+@pytest.fixture(scope="module")
+def scenes(track: Track, landmarks: Landmarks, head: HeadModel) -> list[Scene]:
+    return [scene(picture(track, head, n), WHOLE, track, n, landmarks, head) for n in range(FRAMES)]
+
+
+def test_a_crop_maps_points_as_it_maps_the_picture() -> None:
+    rgb = np.zeros((60, 80, 3), np.uint8)
+    rgb[30:34, 40:44] = 255  # its middle is at 31.5, 41.5
+    for crop in (Crop((20, 10), (40, 40), (80, 120)), Crop((-20, 20), (80, 60), (40, 30))):
+        shown = np.maximum(crop.picture(rgb)[..., 0].astype(float) - OUTSIDE[0], 0)
+        y, x = np.mgrid[: shown.shape[0], : shown.shape[1]]
+        middle = np.array([(x * shown).sum(), (y * shown).sum()]) / shown.sum()
+        assert shown.shape == crop.size[::-1]
+        np.testing.assert_allclose(middle, crop.place(np.array([41.5, 31.5])), atol=0.05)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_each_mode_draws_on_the_face_and_nowhere_else(
+    mode: str, scenes: list[Scene], head: HeadModel
+) -> None:
+    one = scenes[3]
+    rendering = rerender(one, learn_albedo(scenes)) if mode in NEEDS_ALBEDO else None
+    before = one.picture.copy()
+    drawn = draw(one, mode, head, rendering)
+    assert (one.picture == before).all()
+    on_face = np.zeros(SIZE[::-1], np.uint8)
+    one.part(on_face)[one.raster.triangle >= 0] = 1
+    reach = on_face.copy()
+    if mode == "landmarks":  # some are at the ears, and each is joined to its fitted one
+        x, y = np.round(np.concatenate([one.detected, one.fitted])).astype(int).T
+        reach[y, x] = 1
+    reach = cv2.dilate(reach, np.ones((9, 9), np.uint8)).astype(bool)
+    changed = (drawn != one.picture).any(2)
+    assert changed[on_face.astype(bool)].mean() > 0.02
+    if mode == "error":  # the surroundings are grey, with a legend below
+        assert (np.ptp(drawn[: SIZE[1] // 2][~reach[: SIZE[1] // 2]], axis=-1) == 0).all()
+    else:
+        assert not changed[~reach].any()
+
+
+def test_a_picture_like_the_rendering_has_no_error(scenes: list[Scene], head: HeadModel) -> None:
+    one = scenes[2]
+    part = one.part(one.picture)
+    known = np.where(one.raster.triangle >= 0, 255, 0).astype(np.uint8)
+    black = one.part(draw(one, "error", head, Rendering(part, known, part)))[known > 0]
+    off = one.part(draw(one, "error", head, Rendering(part, known, np.roll(part, 8, axis=1))))[known > 0]
+    assert black.max() <= 4
+    assert off.max() > 200
+
+
+def test_the_rendering_comes_near_the_picture_and_less_so_at_a_wrong_pose(
+    scenes: list[Scene], track: Track, landmarks: Landmarks, head: HeadModel
+) -> None:
+    albedo = learn_albedo(scenes)
+
+    def error(one: Scene) -> float:
+        rendering = rerender(one, albedo)
+        difference = cv2.absdiff(rendering.colour, rendering.blurred)[rendering.known > 0]
+        return float(difference.mean())
+
+    right = [error(one) for one in scenes]
+    wrong = scene(picture(track, head, 1), WHOLE, track, 4, landmarks, head)
+    assert max(right) < 4
+    assert error(wrong) > 2 * max(right)
+
+
+def test_what_covers_the_face_stays_out_of_its_colours(scenes: list[Scene], head: HeadModel) -> None:
+    albedo = learn_albedo(scenes)
+    one = scenes[2]
+    covered = Scene(**{**vars(one), "picture": one.picture.copy()})
+    part = covered.part(covered.picture)
+    part[: len(part) // 3] = (20, 200, 20)
+    rendering, plain = rerender(covered, albedo), rerender(one, albedo)
+    below = np.zeros(rendering.known.shape, bool)
+    below[len(below) // 2 :] = True
+    seen = (rendering.known > 0) & below
+    assert cv2.absdiff(rendering.colour, plain.colour)[seen].mean() < 8
+
+
+def test_detected_and_fitted_landmarks_are_both_seen(scenes: list[Scene], head: HeadModel) -> None:
+    one = scenes[0]
+    drawn = draw(one, "landmarks", head, None)
+    cheek = int(np.flatnonzero(head.landmark_embedding.landmarks == 50)[0])
+    for at, colour in ((one.detected[cheek], DETECTED), (one.fitted[cheek], FITTED)):
+        x, y = np.round(at).astype(int)
+        near = drawn[y - 1 : y + 2, x - 1 : x + 2].reshape(-1, 3).astype(int)
+        assert np.abs(near - colour).sum(1).min() < 120
+    assert one.detected[cheek, 0] - one.fitted[cheek, 0] == pytest.approx(SHIFT, abs=1e-3)
+
+
+def test_a_face_outside_of_the_part_shown_leaves_it_as_it_is(
+    track: Track, landmarks: Landmarks, head: HeadModel
+) -> None:
+    away = scene(picture(track, head, 0), Crop((0, 0), (40, 40), (80, 80)), track, 0, landmarks, head)
+    assert (draw(away, "shaded", head, None) == away.picture).all()
