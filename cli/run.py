@@ -39,6 +39,9 @@ def run(
             help="Result folder of metrical-tracker or VHAP to use instead of tracking; with --head."
         ),
     ] = None,
+    min_confidence: Annotated[
+        float, typer.Option(min=0, max=1, help="Leave frames out that are tracked with less confidence.")
+    ] = Settings.min_confidence,
     until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
     from_: Annotated[
         str | None, typer.Option("--from", metavar="STAGE", help="Make again from here on.")
@@ -59,6 +62,7 @@ def run(
         head=_text(head),
         head_embedding=_text(head_embedding),
         tracked=_text(tracked),
+        min_confidence=min_confidence,
     )
     result = personalize_video(video, out, settings, first=from_, until=until, force=force)
     if json_:

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from personalize.files import write_atomic
 from personalize.media import VideoWriter, on_video_clock, read_audio, read_frames
-from personalize.quality import frame_reason
+from personalize.quality import read_reasons
 from personalize.render.text import caption
 from personalize.run import RunFolder, read_landmarks, read_track
-from personalize.run import read_frames as read_frame_table
 from tracker.head import HeadModel
 from tracker.overlay import contact_sheet, draw_overlay, panel_size
 
@@ -32,7 +31,7 @@ def write_overlay(
     """Write overlay.mp4 with the original sound, preview.mp4 for the report, and contact_sheet.png."""
     track = read_track(run.path / "refine/track.npz")
     landmarks = read_landmarks(run.path / "landmarks/landmarks.npz")
-    table = read_frame_table(run.path / "ingest/frames.npz")
+    reasons = read_reasons(run.path / "refine/quality.csv")
     total = len(track.time)
     shown = set(notable_frames(track.valid, track.confidence).tolist())
     kept: dict[int, U8] = {}
@@ -46,7 +45,7 @@ def write_overlay(
         VideoWriter(folder / "preview.mp4", fps, small, preview_sound, AUDIO_RATE, PREVIEW_CRF) as preview,
     ):
         for frame, (time, rgb) in enumerate(read_frames(run.video)):
-            picture = draw_overlay(rgb, track, frame, landmarks, head, frame_reason(table, track, frame))
+            picture = draw_overlay(rgb, track, frame, landmarks, head, str(reasons[frame]))
             film.write(picture, time)
             if time < PREVIEW_S:
                 preview.write(cv2.resize(picture, small, interpolation=cv2.INTER_AREA), time)

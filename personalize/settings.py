@@ -17,6 +17,7 @@ class Settings:
     device: that fine-tuning runs on, `cpu` or `cuda`.
     head: FLAME pickle to track with, None for the embedded head.
     head_embedding: its landmark embedding, None for the one that lies beside it.
+    min_confidence: frames below it are left out of fine-tuning and evaluation, 0..1.
     tracked: folder of another tracker's result, to be read instead of tracking; it needs `head`.
     """
 
@@ -29,3 +30,4 @@ class Settings:
     head: str | None = None
     head_embedding: str | None = None
     tracked: str | None = None
+    min_confidence: float = 0.5

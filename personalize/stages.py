@@ -18,16 +18,20 @@ from personalize.heads import head_assets, run_head
 from personalize.ingest import ingest_video
 from personalize.media import read_frames, write_wav
 from personalize.overlay import write_overlay
-from personalize.quality import write_quality
+from personalize.quality import frame_reasons, write_quality
 from personalize.registration import register_run
 from personalize.settings import Settings
 from personalize.stage import VIDEO, Context, Stage
 from personalize.subject_data import base_path
 from personalize.tracked import read_track_of
 from tracker.camera import estimate_camera
+from tracker.confidence import judge
 from tracker.fit import fit_track
 from tracker.landmarker import track_landmarks
+from tracker.occlusion import FaceWatch
+from tracker.track import Landmarks, Track
 
+JUDGED = ("refine/track.npz", "refine/quality.csv")
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
 
 
@@ -128,23 +132,35 @@ class TrackStage(Stage):
 
 
 class Refine(Stage):
-    """Photometric refinement: for now the landmark track as it is, and quality.csv from what there is."""
+    """Photometric refinement: for now the landmark track as it is, judged by the pictures."""
 
-    name, version = "refine", 1
-    needs, makes = ("ingest/frames.npz", "track/track.npz"), ("track.npz", "quality.csv")
+    name, version, reads = "refine", 2, ("min_confidence",)
+    needs = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "track/track.npz")
+    makes = ("track.npz", "quality.csv")
 
     def make(self, context: Context, folder: Path) -> None:
         root = context.run.path
-        track = files.read_track(root / "track/track.npz")
-        files.write_track(folder / "track.npz", track)
-        write_quality(folder / "quality.csv", track, files.read_frames(root / "ingest/frames.npz"))
+        landmarks = files.read_landmarks(root / "landmarks/landmarks.npz")
+        write_judged(context, folder, files.read_track(root / "track/track.npz"), landmarks)
+
+
+def write_judged(context: Context, folder: Path, track: Track, landmarks: Landmarks) -> None:
+    """Look through the video for what the fit cannot see; write the track and quality.csv."""
+    watch = FaceWatch(landmarks)
+    for done, _ in enumerate(watch.through(read_frames(context.run.video)), 1):
+        context.report.progress(done, len(track.time))
+    judged, doubts = judge(track, watch.appearance())
+    frames = files.read_frames(context.run.path / "ingest/frames.npz")
+    files.write_track(folder / "track.npz", judged)
+    reasons = frame_reasons(frames, judged, doubts, context.settings.min_confidence)
+    write_quality(folder / "quality.csv", judged, reasons)
 
 
 class ReadTracked(Stage):
     """Another tracker's result in the place of ours: camera, track and refine in one."""
 
-    name, version = "refine", 1
-    needs, makes = ("ingest/frames.npz", "landmarks/landmarks.npz"), Refine.makes
+    name, version, reads = "refine", 2, Refine.reads
+    needs, makes = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz"), Refine.makes
 
     def assets(self, settings: Settings) -> dict[str, str]:
         folder = Path(str(settings.tracked))
@@ -156,15 +172,14 @@ class ReadTracked(Stage):
         frames = files.read_frames(root / "ingest/frames.npz")
         landmarks = files.read_landmarks(root / "landmarks/landmarks.npz")
         track = read_track_of(Path(str(settings.tracked)), run_head(settings), frames, landmarks)
-        files.write_track(folder / "track.npz", track)
-        write_quality(folder / "quality.csv", track, frames)
+        write_judged(context, folder, track, landmarks)
 
 
 class Overlay(Stage):
     """The track over the video, to check by eye."""
 
-    name, version = "overlay", 2
-    needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", "refine/track.npz")
+    name, version = "overlay", 3
+    needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", *JUDGED)
     makes, products = ("contact_sheet.png", "preview.mp4"), ("overlay.mp4",)
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -177,8 +192,8 @@ class Overlay(Stage):
 class Registration(Stage):
     """Track -> Motion in the base model's topology, 30 fps, with the sound's offset."""
 
-    name, version = "registration", 1
-    needs = ("ingest/frames.npz", "ingest/audio.wav", "refine/track.npz")
+    name, version = "registration", 2
+    needs = ("ingest/frames.npz", "ingest/audio.wav", *JUDGED)
     makes = ("motion.npz", "registration.json")
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -191,7 +206,7 @@ class Registration(Stage):
 class Finetune(Stage):
     """Motion + speech -> the subject's checkpoint."""
 
-    name, version, reads, resumes = "finetune", 4, ("iterations", "seed", "device"), True
+    name, version, reads, resumes = "finetune", 5, ("iterations", "seed", "device"), True
     needs = (
         "ingest/audio.wav",
         "ingest/split.json",
@@ -210,10 +225,10 @@ class Finetune(Stage):
 class Evaluate(Stage):
     """Metrics on the test split, one clip beside its reference, the report."""
 
-    name, folder, version, reads = "evaluate", "evaluation", 1, ("seed",)
+    name, folder, version, reads = "evaluate", "evaluation", 2, ("seed",)
     needs = (
         *(VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv"),
-        *("overlay/preview.mp4", "overlay/contact_sheet.png", "refine/track.npz"),
+        *("overlay/preview.mp4", "overlay/contact_sheet.png", *JUDGED),
     )
     makes, products = ("metrics.json", "samples/test.mp4", "samples/test.npz"), ("report.html",)
 

@@ -71,7 +71,7 @@ def draw_overlay(rgb: U8, track: Track, frame: int, landmarks: Landmarks, head: 
         # The detected ones are rings around the fitted: where they agree, both are seen.
         _draw_points(drawn, detected[head.landmark_embedding.landmarks], DETECTED, radius + 1)
         _draw_points(drawn, fitted, FITTED, radius)
-    _draw_confidence(drawn, float(track.confidence[frame]), bool(track.valid[frame]), reason)
+    _draw_confidence(drawn, float(track.confidence[frame]), reason)
     return np.concatenate([picture, drawn], axis=1)
 
 
@@ -100,14 +100,14 @@ def _draw_points(picture: U8, points: F32, colour: tuple[int, int, int], radius:
         cv2.circle(picture, (x, y), radius * 16, colour, -1, cv2.LINE_AA, 4)
 
 
-def _draw_confidence(picture: U8, confidence: float, valid: bool, reason: str) -> None:
+def _draw_confidence(picture: U8, confidence: float, reason: str) -> None:
     height, width = picture.shape[:2]
-    colour = BAD if not valid else GOOD if confidence >= 0.5 else DOUBTFUL
+    colour = BAD if reason != "ok" else GOOD if confidence >= 0.5 else DOUBTFUL
     bar = round(width * confidence)
     thick = max(4, height // 120)
     picture[-thick:] = (40, 40, 40)
     picture[-thick:, :bar] = colour
-    text = f"confidence {confidence:.2f}" if valid else f"left out: {reason}"
+    text = f"confidence {confidence:.2f}" if reason == "ok" else f"left out: {reason}"
     size = height / 900
     for shade_of, weight in (((0, 0, 0), 4), (colour, 2)):
         cv2.putText(
