@@ -29,7 +29,7 @@ from tracker.confidence import judge
 from tracker.fit import fit_track
 from tracker.landmarker import track_landmarks
 from tracker.occlusion import FaceWatch
-from tracker.track import Landmarks, Track
+from tracker.track import Track
 
 JUDGED = ("refine/track.npz", "refine/quality.csv")
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
@@ -62,24 +62,27 @@ class Ingest(Stage):
 
 
 class LandmarkStage(Stage):
-    """478 points and 52 scores on every usable frame."""
+    """478 points and 52 scores on every frame that shows the face, and what covers or blurs it."""
 
-    name, version = "landmarks", 1
-    needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz",)
+    name, version = "landmarks", 2
+    needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
         return {"face_landmarker": _asset_hash(LANDMARKER_FILE)}
 
     def make(self, context: Context, folder: Path) -> None:
         frames = files.read_frames(context.run.path / "ingest/frames.npz")
+        watch = FaceWatch()
         landmarks = track_landmarks(
             read_frames(context.run.video),
             len(frames.time),
             cuts=set(np.flatnonzero(np.diff(frames.segment)) + 1),
             boxes=frames.box,
             progress=context.report.progress,
+            watch=watch,
         )
         files.write_landmarks(folder / "landmarks.npz", landmarks)
+        files.write_appearance(folder / "appearance.npz", watch.appearance())
 
 
 class CameraStage(Stage):
@@ -135,22 +138,18 @@ class Refine(Stage):
     """Photometric refinement: for now the landmark track as it is, judged by the pictures."""
 
     name, version, reads = "refine", 2, ("min_confidence",)
-    needs = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "track/track.npz")
+    needs = ("ingest/frames.npz", "landmarks/appearance.npz", "track/track.npz")
     makes = ("track.npz", "quality.csv")
 
     def make(self, context: Context, folder: Path) -> None:
-        root = context.run.path
-        landmarks = files.read_landmarks(root / "landmarks/landmarks.npz")
-        write_judged(context, folder, files.read_track(root / "track/track.npz"), landmarks)
+        write_judged(context, folder, files.read_track(context.run.path / "track/track.npz"))
 
 
-def write_judged(context: Context, folder: Path, track: Track, landmarks: Landmarks) -> None:
-    """Look through the video for what the fit cannot see; write the track and quality.csv."""
-    watch = FaceWatch(landmarks)
-    for done, _ in enumerate(watch.through(read_frames(context.run.video)), 1):
-        context.report.progress(done, len(track.time))
-    judged, doubts = judge(track, watch.appearance())
-    frames = files.read_frames(context.run.path / "ingest/frames.npz")
+def write_judged(context: Context, folder: Path, track: Track) -> None:
+    """Write the track with its confidence lowered by what the pictures tell, and quality.csv."""
+    root = context.run.path
+    judged, doubts = judge(track, files.read_appearance(root / "landmarks/appearance.npz"))
+    frames = files.read_frames(root / "ingest/frames.npz")
     files.write_track(folder / "track.npz", judged)
     reasons = frame_reasons(frames, judged, doubts, context.settings.min_confidence)
     write_quality(folder / "quality.csv", judged, reasons)
@@ -160,7 +159,8 @@ class ReadTracked(Stage):
     """Another tracker's result in the place of ours: camera, track and refine in one."""
 
     name, version, reads = "refine", 2, Refine.reads
-    needs, makes = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz"), Refine.makes
+    needs = ("ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz")
+    makes = Refine.makes
 
     def assets(self, settings: Settings) -> dict[str, str]:
         folder = Path(str(settings.tracked))
@@ -172,7 +172,7 @@ class ReadTracked(Stage):
         frames = files.read_frames(root / "ingest/frames.npz")
         landmarks = files.read_landmarks(root / "landmarks/landmarks.npz")
         track = read_track_of(Path(str(settings.tracked)), run_head(settings), frames, landmarks)
-        write_judged(context, folder, track, landmarks)
+        write_judged(context, folder, track)
 
 
 class Overlay(Stage):

@@ -7,7 +7,6 @@ hand's, a cup's or a microphone's are not. The pattern is learned from the clip 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -16,10 +15,9 @@ from numpy.typing import NDArray
 
 from tracker.landmark_indices import IRIS_CENTRES, LEFT_EYE_OUTER, LIPS, OVAL, POINTS, RIGHT_EYE_OUTER
 from tracker.landmarker import crop, roi_from_points
-from tracker.track import F32, F64, Landmarks
+from tracker.track import F32, F64
 
 U8 = NDArray[np.uint8]
-Frame = tuple[float, U8]
 
 SIDE = 128  # px of the face's crop, about 36 of them between the outer corners of the eyes
 SMOOTHING_PX = 2.0  # of the crop: colours of patches, not of pores and noise
@@ -34,58 +32,62 @@ EYE_REACH = 0.27  # of the distance between the eyes: lids and gaze change withi
 
 @dataclass(frozen=True)
 class Appearance:
-    """strangeness: [T] 0..2, 1 - correlation of the region that looks least like the face's own; 0 where no face is.
-    sharpness: [T] mean Laplacian of the face relative to its brightness, over the clip's median, 1 where no face is."""
+    """How each frame's face looks.
+
+    strangeness: [T] 0..2, 1 - correlation of the region that looks least like the face's own; 0 where no face is.
+    sharpness: [T] mean Laplacian of the face relative to its brightness, over the clip's median,
+        1 where no face is.
+    """
 
     strangeness: F32
     sharpness: F32
 
 
 class FaceWatch:
-    """Looks at the face of each picture that passes, so that no pass over the video is needed for it."""
+    """Looks at the face of each picture while its landmarks are read; no pass over the video of its own."""
 
-    def __init__(self, landmarks: Landmarks) -> None:
-        total = len(landmarks.time)
-        self._points = landmarks.points
-        self._colour = np.zeros((total, POINTS, 3), np.uint8)
-        self._detail = np.full(total, np.nan, np.float32)
-        self._place = np.full((total, POINTS, 2), np.nan, np.float32)
+    def __init__(self) -> None:
+        self._colour: list[U8] = []
+        self._place: list[NDArray[np.float16]] = []
+        self._detail: list[float] = []
 
-    def through(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """The same frames (time s, rgb [H, W, 3] u8), from the clip's first on, each looked at as it passes."""
-        for index, (time, rgb) in enumerate(frames):
-            if index < len(self._points) and np.isfinite(self._points[index]).all():
-                self._see(index, rgb)
-            yield time, rgb
-
-    def _see(self, index: int, rgb: U8) -> None:
-        roi = roi_from_points(self._points[index])
+    def see(self, rgb: U8, points: F32) -> None:
+        """The next picture [H, W, 3] and its landmarks [478, 3] px, NaN where there is no face."""
+        if not np.isfinite(points).all():
+            self._colour.append(np.zeros((POINTS, 3), np.uint8))
+            self._place.append(np.full((POINTS, 2), np.nan, np.float16))
+            self._detail.append(np.nan)
+            return
+        roi = roi_from_points(points)
         face = cv2.resize(crop(rgb, roi), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
         to_picture = roi.to_picture()
-        unit = np.linalg.solve(to_picture[:, :2], (self._points[index, :, :2] - to_picture[:, 2]).T).T
-        at = (unit * SIDE - 0.5).astype(np.float32)
+        unit = np.linalg.solve(to_picture[:, :2], (points[:, :2] - to_picture[:, 2]).T).T
+        x, y = (unit * SIDE - 0.5).astype(np.float32).T[..., None]
         smooth = cv2.GaussianBlur(face, (0, 0), SMOOTHING_PX)
-        x, y = at[:, None, 0], at[:, None, 1]
-        self._colour[index] = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
-        grey = cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)
-        inside = slice(SIDE // 4, -SIDE // 8), slice(SIDE // 4, -SIDE // 4)
-        edges = np.abs(cv2.Laplacian(grey, cv2.CV_32F)[inside])
-        self._detail[index] = edges.mean() / (grey[inside].mean() + DARK)
-        self._place[index] = unit
+        self._colour.append(
+            cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(np.uint8)
+        )
+        self._place.append(unit.astype(np.float16))
+        self._detail.append(_detail(cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)))
 
     def appearance(self) -> Appearance:
-        """Of the frames seen so far; meant for when all have passed."""
-        strangeness, sharpness = (
-            np.zeros(len(self._detail), np.float32),
-            np.ones(len(self._detail), np.float32),
-        )
-        seen = np.flatnonzero(np.isfinite(self._detail))
+        """Of the pictures seen so far; meant for when all have passed."""
+        total, detail = len(self._detail), np.array(self._detail, np.float32)
+        strangeness, sharpness = np.zeros(total, np.float32), np.ones(total, np.float32)
+        seen = np.flatnonzero(np.isfinite(detail))
         if len(seen):
-            for region in regions(np.median(self._place[seen], axis=0)):
-                found = _strangeness(self._colour[np.ix_(seen, region)])
-                strangeness[seen] = np.maximum(strangeness[seen], found)
-            sharpness[seen] = self._detail[seen] / max(float(np.median(self._detail[seen])), 1e-6)
+            colour, place = np.stack(self._colour)[seen], np.stack(self._place)[seen]
+            for region in regions(np.median(place, axis=0).astype(np.float64)):
+                strangeness[seen] = np.maximum(strangeness[seen], _strangeness(colour[:, region]))
+            sharpness[seen] = detail[seen] / max(float(np.median(detail[seen])), 1e-6)
         return Appearance(strangeness, sharpness)
+
+
+def _detail(face: U8) -> float:
+    """Mean Laplacian of a grey crop [SIDE, SIDE] over its brightness, within the face."""
+    inside = slice(SIDE // 4, -SIDE // 8), slice(SIDE // 4, -SIDE // 4)
+    edges = np.abs(cv2.Laplacian(face, cv2.CV_32F)[inside])
+    return float(edges.mean() / (face[inside].mean() + DARK))
 
 
 def regions(place: NDArray[np.floating]) -> list[NDArray[np.intp]]:
