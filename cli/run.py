@@ -46,6 +46,9 @@ def run(
             help="What the overlay film shows beside the video: shaded, wireframe, albedo, error, landmarks.",
         ),
     ] = ",".join(Settings.overlay),
+    min_confidence: Annotated[
+        float, typer.Option(min=0, max=1, help="Leave frames out that are tracked with less confidence.")
+    ] = Settings.min_confidence,
     until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
     from_: Annotated[
         str | None, typer.Option("--from", metavar="STAGE", help="Make again from here on.")
@@ -67,6 +70,7 @@ def run(
         head_embedding=_text(head_embedding),
         tracked=_text(tracked),
         overlay=tuple(overlay.split(",")),
+        min_confidence=min_confidence,
     )
     result = personalize_video(video, out, settings, first=from_, until=until, force=force)
     if json_:

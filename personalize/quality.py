@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,15 +35,47 @@ def head_angles(rotation: NDArray[np.float32]) -> NDArray[np.float64]:
     return angles * np.array([1.0, -1.0, -1.0])
 
 
-def frame_reason(frames: Frames, track: Track, frame: int) -> str:
-    """Why a frame is left out; `ok` when it is used."""
-    if track.valid[frame]:
-        return "ok"
-    reason = frames.reasons[frames.reason[frame]]
-    return reason if reason != "ok" else "no_face"
+@dataclass(frozen=True)
+class LeftOut:
+    """A stretch of frames left out for one reason: from its first frame to the end of its last, s."""
+
+    start_s: float
+    end_s: float
+    reason: str
 
 
-def write_quality(path: Path, refined: Refined, frames: Frames) -> None:
+def frame_reasons(frames: Frames, track: Track, doubts: Sequence[str], least: float) -> list[str]:
+    """Why each frame is left out; `ok` where it is used, to learn from and to be judged by.
+
+    Ingest's reason, `no_face` where nothing was fitted, or below the `least` confidence what speaks against the fit
+    (`doubts`, see tracker.confidence.judge). This is the one place that decides; quality.csv carries it on.
+    """
+    known = (frames.reasons[index] for index in frames.reason)
+    return [
+        reason if reason != "ok" else "no_face" if not valid else doubt if sure < least else "ok"
+        for reason, valid, doubt, sure in zip(known, track.valid, doubts, track.confidence)
+    ]
+
+
+def read_reasons(path: Path) -> NDArray[np.str_]:
+    """The reason of each frame [T], from quality.csv."""
+    with path.open(newline="", encoding="utf-8") as stream:
+        return np.array([row["reason"] for row in csv.DictReader(stream)])
+
+
+def left_out(time: NDArray[np.float64], reasons: NDArray[np.str_]) -> list[LeftOut]:
+    """The stretches of frames [T] that are not `ok`, in order."""
+    ends = np.append(time[1:], time[-1] + (np.median(np.diff(time)) if len(time) > 1 else 0.0))
+    first = np.flatnonzero(np.append(True, reasons[1:] != reasons[:-1]))
+    last = np.append(first[1:], len(reasons)) - 1
+    return [
+        LeftOut(float(time[a]), float(ends[b]), str(reasons[a]))
+        for a, b in zip(first, last)
+        if reasons[a] != "ok"
+    ]
+
+
+def write_quality(path: Path, refined: Refined, reasons: Sequence[str]) -> None:
     """Write the table; `photometric` is 1 for a usual frame of the clip and empty where nothing was compared."""
     track = refined.track
     stream = io.StringIO()
@@ -61,7 +95,7 @@ def write_quality(path: Path, refined: Refined, frames: Frames) -> None:
                 "" if np.isnan(refined.photometric[frame]) else f"{refined.photometric[frame]:.3f}",
                 f"{track.lip_gap_mm[frame]:.3f}",
                 *(f"{angle:.2f}" for angle in angles[frame]),
-                frame_reason(frames, track, frame),
+                reasons[frame],
             ]
         )
     write_text(path, stream.getvalue())

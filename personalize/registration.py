@@ -18,9 +18,11 @@ from scipy.interpolate import PchipInterpolator
 from model.checkpoint import Checkpoint
 from model.motion import FPS, Motion, topology_hash
 from personalize.av_sync import estimate_av_offset
+from personalize.errors import UserError
 from personalize.files import write_json
 from personalize.heads import run_head
 from personalize.media import read_audio
+from personalize.quality import read_reasons
 from personalize.reporter import Reporter
 from personalize.run import RunFolder, read_frames, read_track, tool_version
 from personalize.settings import Settings
@@ -68,6 +70,13 @@ def register_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     """Write motion.npz and registration.json of a run: the motion, and where its sound lies on its clock."""
     frames = read_frames(run.path / "ingest/frames.npz")
     track = read_track(run.path / "refine/track.npz")
+    used = read_reasons(run.path / "refine/quality.csv") == "ok"
+    if not used.any():
+        raise UserError(
+            f"{run.video}: no frame is tracked with a confidence of {settings.min_confidence}; look at "
+            f"{run.path / 'overlay.mp4'}, and give a better video or a lower --min-confidence"
+        )
+    track = dataclasses.replace(track, valid=used)
     base = Checkpoint.load(base_path(settings))
     motion, facts = register(
         track, frames.segment, run_head(settings), BaseFace(base.template, base.faces, base.basis)

@@ -17,6 +17,7 @@ from personalize.errors import UserError
 from personalize.files import read_npz, sha256_file, write_json, write_npz
 from personalize.settings import Settings
 from personalize.shots import Frames
+from tracker.occlusion import Appearance
 from tracker.track import Bundle, Camera, Landmarks, Track
 
 SCHEMA = 1
@@ -150,6 +151,17 @@ def read_landmarks(path: Path) -> Landmarks:
     data["blendshape_names"] = tuple(str(name) for name in data["blendshape_names"])
     data["size"] = (int(data["size"][0]), int(data["size"][1]))
     return Landmarks(**data)
+
+
+def write_appearance(path: Path, appearance: Appearance) -> None:
+    """`landmarks/appearance.npz`."""
+    write_npz(path, **vars(appearance))
+
+
+def read_appearance(path: Path) -> Appearance:
+    """Inverse of `write_appearance`."""
+    data: dict[str, Any] = read_npz(path)
+    return Appearance(**data)
 
 
 def write_camera(folder: Path, camera: Camera, bundle: Bundle) -> None:

@@ -17,6 +17,7 @@ class Settings:
     device: that fine-tuning runs on, `cpu` or `cuda`.
     head: FLAME pickle to track with, None for the embedded head.
     head_embedding: its landmark embedding, None for the one that lies beside it.
+    min_confidence: frames below it are left out of fine-tuning and evaluation, 0..1.
     tracked: folder of another tracker's result, to be read instead of tracking; it needs `head`.
     overlay: what the overlay film shows beside the video, of tracker.overlay.MODES.
     """
@@ -31,3 +32,4 @@ class Settings:
     head_embedding: str | None = None
     tracked: str | None = None
     overlay: tuple[str, ...] = ("wireframe",)
+    min_confidence: float = 0.5

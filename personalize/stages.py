@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -18,17 +19,20 @@ from personalize.heads import head_assets, run_head
 from personalize.ingest import ingest_video
 from personalize.media import read_frames, write_wav
 from personalize.overlay import write_overlay
-from personalize.quality import write_quality
+from personalize.quality import frame_reasons, write_quality
 from personalize.registration import register_run
 from personalize.settings import Settings
 from personalize.stage import VIDEO, Context, Stage
 from personalize.subject_data import base_path
 from personalize.tracked import read_track_of
 from tracker.camera import estimate_camera
+from tracker.confidence import judge
 from tracker.fit import fit_track
 from tracker.landmarker import track_landmarks
-from tracker.refine import refine_track
+from tracker.occlusion import FaceWatch
+from tracker.refine import Refined, refine_track
 
+JUDGED = ("refine/track.npz", "refine/quality.csv")
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
 
 
@@ -59,24 +63,27 @@ class Ingest(Stage):
 
 
 class LandmarkStage(Stage):
-    """478 points and 52 scores on every usable frame."""
+    """478 points and 52 scores on every frame that shows the face, and what covers or blurs it."""
 
-    name, version = "landmarks", 1
-    needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz",)
+    name, version = "landmarks", 2
+    needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
         return {"face_landmarker": _asset_hash(LANDMARKER_FILE)}
 
     def make(self, context: Context, folder: Path) -> None:
         frames = files.read_frames(context.run.path / "ingest/frames.npz")
+        watch = FaceWatch()
         landmarks = track_landmarks(
             read_frames(context.run.video),
             len(frames.time),
             cuts=set(np.flatnonzero(np.diff(frames.segment)) + 1),
             boxes=frames.box,
             progress=context.report.progress,
+            watch=watch,
         )
         files.write_landmarks(folder / "landmarks.npz", landmarks)
+        files.write_appearance(folder / "appearance.npz", watch.appearance())
 
 
 class CameraStage(Stage):
@@ -129,39 +136,48 @@ class TrackStage(Stage):
 
 
 class Refine(Stage):
-    """The track again, with the grey levels of the skin; quality.csv."""
+    """The track again, with the grey levels of the skin, and judged by the pictures."""
 
-    name, version = "refine", 2
+    name, version, reads = "refine", 2, ("min_confidence",)
     needs = (
-        *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz"),
+        *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),
     )
     makes = ("track.npz", "quality.csv")
 
     def assets(self, settings: Settings) -> dict[str, str]:
-        return {"head": load_head().sha256}
+        return head_assets(settings)
 
     def make(self, context: Context, folder: Path) -> None:
         root = context.run.path
-        frames = files.read_frames(root / "ingest/frames.npz")
         refined = refine_track(
             files.read_track(root / "track/track.npz"),
             files.read_landmarks(root / "landmarks/landmarks.npz"),
             files.read_camera(root / "camera")[0],
-            load_head(),
-            frames.segment,
+            run_head(context.settings),
+            files.read_frames(root / "ingest/frames.npz").segment,
             lambda: read_frames(context.run.video),
             context.report.progress,
         )
-        files.write_track(folder / "track.npz", refined.track)
-        write_quality(folder / "quality.csv", refined, frames)
+        write_judged(context, folder, refined)
+
+
+def write_judged(context: Context, folder: Path, refined: Refined) -> None:
+    """Write the track with its confidence lowered by what the pictures tell, and quality.csv."""
+    root = context.run.path
+    judged, doubts = judge(refined.track, files.read_appearance(root / "landmarks/appearance.npz"))
+    frames = files.read_frames(root / "ingest/frames.npz")
+    files.write_track(folder / "track.npz", judged)
+    reasons = frame_reasons(frames, judged, doubts, context.settings.min_confidence)
+    write_quality(folder / "quality.csv", replace(refined, track=judged), reasons)
 
 
 class ReadTracked(Stage):
     """Another tracker's result in the place of ours: camera, track and refine in one."""
 
-    name, version = "refine", 1
-    needs, makes = ("ingest/frames.npz", "landmarks/landmarks.npz"), Refine.makes
+    name, version, reads = "refine", 2, Refine.reads
+    needs = ("ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz")
+    makes = Refine.makes
 
     def assets(self, settings: Settings) -> dict[str, str]:
         folder = Path(str(settings.tracked))
@@ -173,15 +189,15 @@ class ReadTracked(Stage):
         frames = files.read_frames(root / "ingest/frames.npz")
         landmarks = files.read_landmarks(root / "landmarks/landmarks.npz")
         track = read_track_of(Path(str(settings.tracked)), run_head(settings), frames, landmarks)
-        files.write_track(folder / "track.npz", track)
-        write_quality(folder / "quality.csv", track, frames)
+        unknown = np.full(len(track.time), np.nan, np.float32)
+        write_judged(context, folder, Refined(track, unknown))
 
 
 class Overlay(Stage):
     """The track over the video, to check by eye."""
 
-    name, version, reads = "overlay", 3, ("overlay",)
-    needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", "refine/track.npz")
+    name, version, reads = "overlay", 4, ("overlay",)
+    needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", *JUDGED)
     makes, products = ("contact_sheet.png", "preview.mp4"), ("overlay.mp4",)
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -195,8 +211,8 @@ class Overlay(Stage):
 class Registration(Stage):
     """Track -> Motion in the base model's topology, 30 fps, with the sound's offset."""
 
-    name, version = "registration", 1
-    needs = ("ingest/frames.npz", "ingest/audio.wav", "refine/track.npz")
+    name, version = "registration", 2
+    needs = ("ingest/frames.npz", "ingest/audio.wav", *JUDGED)
     makes = ("motion.npz", "registration.json")
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -209,7 +225,7 @@ class Registration(Stage):
 class Finetune(Stage):
     """Motion + speech -> the subject's checkpoint."""
 
-    name, version, reads, resumes = "finetune", 4, ("iterations", "seed", "device"), True
+    name, version, reads, resumes = "finetune", 5, ("iterations", "seed", "device"), True
     needs = (
         "ingest/audio.wav",
         "ingest/split.json",
@@ -228,10 +244,10 @@ class Finetune(Stage):
 class Evaluate(Stage):
     """Metrics on the test split, one clip beside its reference, the report."""
 
-    name, folder, version, reads = "evaluate", "evaluation", 1, ("seed", "overlay")
+    name, folder, version, reads = "evaluate", "evaluation", 2, ("seed", "overlay")
     needs = (
         *(VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv"),
-        *("overlay/preview.mp4", "overlay/contact_sheet.png", "refine/track.npz"),
+        *("overlay/preview.mp4", "overlay/contact_sheet.png", *JUDGED),
     )
     makes, products = ("metrics.json", "samples/test.mp4", "samples/test.npz"), ("report.html",)
 

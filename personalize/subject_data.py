@@ -76,12 +76,18 @@ def load_subject_data(run: RunFolder, style: int, encoder: SpeechEncoder) -> Sub
     for part in ("train", "val", "test"):
         parts[part] = []
         for start_s, end_s in joined(split[part]):
-            first, last = np.searchsorted(times, [start_s, end_s])
-            if last - first >= SHORTEST_SPAN_S * motion.fps:
-                rows = slice(int(first), int(last))
+            for first, last in tracked(motion, *np.searchsorted(times, [start_s, end_s])):
+                rows = slice(first, last)
                 sequence = Sequence(motion.coefficients[rows], features[rows], motion.valid[rows], style)
-                parts[part].append(Span(rows.start, rows.stop, sequence))
+                parts[part].append(Span(first, last, sequence))
     return SubjectData(motion, features, parts)
+
+
+def tracked(motion: Motion, first: int, last: int) -> list[tuple[int, int]]:
+    """Stretches [first, last) of a span without a long gap in the tracking, as long as a word at least."""
+    seen = first + np.flatnonzero(motion.valid[first:last])
+    runs = np.split(seen, np.flatnonzero(np.diff(seen) > JOINED_GAP_S * motion.fps) + 1)
+    return [(int(run[0]), int(run[-1]) + 1) for run in runs if len(run) >= SHORTEST_SPAN_S * motion.fps]
 
 
 def joined(stretches: list[list[float]]) -> list[list[float]]:

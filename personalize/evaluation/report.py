@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from personalize.evaluation import charts
 from personalize.evaluation.evaluate import SYSTEMS, Evaluation
 from personalize.files import write_text
 from personalize.overlay import PREVIEW_S
-from personalize.quality import frame_reason
-from personalize.run import RunFolder, read_camera, read_frames, read_track, tool_version
+from personalize.quality import LeftOut, left_out, read_reasons
+from personalize.run import RunFolder, read_camera, read_track, tool_version
 from tracker.overlay import MODES
 
 # Metric of metrics.json -> name and meaning in the table.
@@ -31,12 +30,12 @@ COLUMNS = {
     "closure": "share of lip closures reached (higher is better)",
     "div_e": "difference between samples, mm",
 }
+LISTED = 12  # spans left out that the report tells of
 
 
 def write_report(run: RunFolder, evaluation: Evaluation, modes: Sequence[str], folder: Path) -> None:
     """Write `folder`/report.html from the run's files and the evaluation. modes: those of the overlay."""
     track = read_track(run.path / "refine/track.npz")
-    frames = read_frames(run.path / "ingest/frames.npz")
     guidance = run.read_json("finetune/guidance.json")
     media = run.read_json("ingest/media.json")
     environment = Environment(
@@ -44,18 +43,21 @@ def write_report(run: RunFolder, evaluation: Evaluation, modes: Sequence[str], f
     )
     metrics = evaluation.metrics
     duration = float(track.time[-1])
-    reasons = [frame_reason(frames, track, frame) for frame in np.flatnonzero(~track.valid).tolist()]
+    reasons = read_reasons(run.path / "refine/quality.csv")
+    used = reasons == "ok"
+    gaps = left_out(track.time, reasons)
     page = environment.get_template("report.html").render(
         video=run.video.name,
         version=tool_version(),
         when=time.strftime("%Y-%m-%d %H:%M"),
         warnings=media["warnings"],
-        cards=_cards(metrics["systems"], duration, float(track.valid.mean())),
+        cards=_cards(metrics["systems"], duration, float(used.mean())),
         overlay=_data_url(run.path / "overlay/preview.mp4", "video/mp4"),
         modes=[{"name": mode, "meaning": MODES[mode]} for mode in modes],
         overlay_cut=round(PREVIEW_S) if duration > PREVIEW_S else 0,
-        timeline=charts.timeline(track.time, track.confidence, track.valid),
-        reasons=", ".join(f"{reasons.count(name)} {name}" for name in sorted(set(reasons))),
+        timeline=charts.timeline(track.time, track.confidence, used),
+        left_out=_longest(gaps),
+        left_out_more=max(0, len(gaps) - LISTED),
         contact_sheet=_photograph_url(run.path / "overlay/contact_sheet.png"),
         clip=_data_url(folder / "samples/test.mp4", "video/mp4"),
         lip_opening=charts.lip_opening(evaluation.clip_time, evaluation.reference, evaluation.samples),
@@ -77,11 +79,17 @@ def _cards(systems: dict[str, dict[str, float]], duration: float, tracked: float
     ours, base = systems["personalized"], systems["base"]
     return [
         {"value": f"{duration:.0f} s", "label": "of video"},
-        {"value": f"{tracked:.0%}", "label": "of frames tracked"},
+        {"value": f"{tracked:.0%}", "label": "of frames used"},
         {"value": f"{ours['lip_sync']:.2f} mm", "label": f"lip_sync (base {base['lip_sync']:.2f})"},
         {"value": f"{ours['l2_lip']:.2f} mm", "label": f"lip error (base {base['l2_lip']:.2f})"},
         {"value": f"{ours['lip_gap_r']:.2f}", "label": "correlation of lip opening"},
     ]
+
+
+def _longest(gaps: list[LeftOut]) -> list[LeftOut]:
+    """The LISTED longest, in order of time."""
+    longest = sorted(gaps, key=lambda gap: gap.start_s - gap.end_s)[:LISTED]
+    return sorted(longest, key=lambda gap: gap.start_s)
 
 
 def _loss(path: Path) -> tuple[list[float], list[float]]:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from personalize.media import read_frames
-from personalize.quality import frame_reason
+from personalize.quality import read_reasons
 from personalize.run import RunFolder, read_landmarks, read_track
-from personalize.run import read_frames as read_frame_table
 from tracker.albedo import Albedo, learn_albedo
 from tracker.head import HeadModel
 from tracker.overlay import NEEDS_ALBEDO, draw_modes, letter
@@ -52,8 +51,7 @@ class TrackPictures:
         """Read the run's track; learn the subject's albedo where one of the modes needs it."""
         track = read_track(run.path / "refine/track.npz")
         landmarks = read_landmarks(run.path / "landmarks/landmarks.npz")
-        table = read_frame_table(run.path / "ingest/frames.npz")
-        reasons = [frame_reason(table, track, frame) for frame in range(len(track.time))]
+        reasons = read_reasons(run.path / "refine/quality.csv").tolist()
         valid = np.flatnonzero(track.valid)
         crop = around_face(landmarks.points[valid, :, :2], landmarks.size)
         albedo = None

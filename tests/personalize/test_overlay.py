@@ -10,15 +10,16 @@ import pytest
 from personalize.errors import UserError
 from personalize.media import read_frames
 from personalize.overlay import COLUMNS, SPREAD, WORST, check_modes, notable_frames, write_overlay
+from personalize.quality import write_quality
 from personalize.render.track import BAD, FOOTER, GOOD, PANEL, TILE, around_face, grid
-from personalize.run import RunFolder, write_frames, write_landmarks, write_track
+from personalize.run import RunFolder, write_landmarks, write_track
 from personalize.settings import Settings
-from personalize.shots import REASONS, Frames
 from personalize.stages import Overlay
 from tests.personalize.video_factory import clicks, write_video
 from tests.tracker.turning_head import picture, shifted_landmarks, turning_track
 from tracker.head import load_head
 from tracker.overlay import MODES
+from tracker.refine import Refined
 
 FRAMES, LEFT_OUT = 6, 4
 
@@ -90,14 +91,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     valid = np.arange(FRAMES) != LEFT_OUT
     confidence = np.where(valid, 0.9, 0).astype(np.float32)
     run = RunFolder.create(folder / "run", video)
-    for name in ("ingest", "landmarks", "refine"):
+    for name in ("landmarks", "refine"):
         (run.path / name).mkdir(parents=True)
-    blurred, shot = (~valid * REASONS.index("blurred")).astype(np.uint8), np.zeros(FRAMES, np.int32)
-    frames = Frames(track.time, valid, blurred, REASONS, shot, np.zeros((FRAMES, 4), np.float32))
-    write_frames(run.path / "ingest/frames.npz", frames)
     write_landmarks(run.path / "landmarks/landmarks.npz", shifted_landmarks(track, head, 0))
     track = dataclasses.replace(track, valid=valid, confidence=confidence)
     write_track(run.path / "refine/track.npz", track)
+    unknown = np.full(FRAMES, np.nan, np.float32)
+    reasons = ["ok" if used else "blurred" for used in valid]
+    write_quality(run.path / "refine/quality.csv", Refined(track, unknown), reasons)
     return run
 
 

@@ -1,0 +1,53 @@
+"""Why frames are left out: one answer, kept in quality.csv and told in spans."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from personalize.quality import frame_reasons, left_out, read_reasons, write_quality
+from personalize.shots import REASONS, Frames
+from tests.personalize.test_registration import track_of
+from tracker.head import load_head
+from tracker.refine import Refined
+
+TIME = np.arange(6) / 25
+DOUBTS = ["occluded", "occluded", "blurred", "poor_fit", "poor_fit", "poor_fit"]
+
+
+@pytest.fixture
+def track():
+    head = load_head()
+    track = track_of(head, np.zeros((6, len(head.expression_basis))), TIME)
+    valid = np.array([False, False, True, True, True, True])
+    return replace(track, valid=valid, confidence=np.float32([0, 0, 0.3, 0.49, 0.5, 1]))
+
+
+@pytest.fixture
+def frames() -> Frames:
+    reason = np.array([REASONS.index("cut"), 0, 0, 0, 0, 0], np.uint8)
+    return Frames(TIME, reason == 0, reason, REASONS, np.zeros(6, np.int32), np.zeros((6, 4), np.float32))
+
+
+def test_the_first_reason_counts(frames, track):
+    assert frame_reasons(frames, track, DOUBTS, 0.5) == ["cut", "no_face", "blurred", "poor_fit", "ok", "ok"]
+    assert frame_reasons(frames, track, DOUBTS, 0.0) == ["cut", "no_face", "ok", "ok", "ok", "ok"]
+
+
+def test_quality_csv_carries_the_reasons(frames, track, tmp_path: Path):
+    reasons = frame_reasons(frames, track, DOUBTS, 0.5)
+    photometric = np.array([np.nan, np.nan, 3, 1.5, 1, 0.5], np.float32)
+    write_quality(tmp_path / "quality.csv", Refined(track, photometric), reasons)
+    assert read_reasons(tmp_path / "quality.csv").tolist() == reasons
+    rows = list(csv.DictReader((tmp_path / "quality.csv").open(newline="")))
+    assert [row["photometric"] for row in rows] == ["", "", "3.000", "1.500", "1.000", "0.500"]
+
+
+def test_spans_end_where_the_next_frame_begins():
+    reasons = np.array(["ok", "occluded", "occluded", "cut", "ok", "no_face"])
+    spans = [(span.start_s, pytest.approx(span.end_s), span.reason) for span in left_out(TIME, reasons)]
+    assert spans == [(0.04, 0.12, "occluded"), (0.12, 0.16, "cut"), (0.2, 0.24, "no_face")]
+    assert left_out(TIME, np.array(["ok"] * 6)) == []
+    assert left_out(TIME[:1], np.array(["cut"]))[0].end_s == 0

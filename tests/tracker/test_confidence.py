@@ -1,0 +1,55 @@
+"""Each cue lowers confidence, and the one that lowers it most is the doubt."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.personalize.test_registration import track_of
+from tracker.confidence import judge, off_axis_deg
+from tracker.head import load_head
+from tracker.occlusion import Appearance
+
+FACING = np.array([np.pi, 0, 0], np.float32)  # the head's y up and z out of the face, in the camera's axes
+
+
+@pytest.fixture
+def track():
+    head = load_head()
+    track = track_of(head, np.zeros((4, len(head.expression_basis))), np.arange(4) / 25)
+    ahead = np.tile(np.float32([0, 0, 0.6]), (4, 1))
+    return replace(track, rotation=np.tile(FACING, (4, 1)), translation=ahead)
+
+
+def test_nothing_against_a_frame_leaves_its_confidence(track):
+    judged, _ = judge(track, Appearance(np.full(4, 0.05, np.float32), np.ones(4, np.float32)))
+    np.testing.assert_allclose(judged.confidence, track.confidence)
+
+
+def test_the_doubt_is_what_costs_most(track):
+    turned = track.rotation.copy()
+    turned[2] = turn(60)
+    poor = np.float32([1, 1, 1, 0.2])
+    appearance = Appearance(np.float32([0.6, 0, 0, 0.12]), np.float32([1, 0.3, 1, 1]))
+    judged, doubts = judge(replace(track, rotation=turned, confidence=poor), appearance)
+    assert doubts == ["occluded", "blurred", "turned_away", "poor_fit"]
+    assert (judged.confidence < 0.5).all() and (judged.confidence <= poor).all()
+
+
+def turn(yaw_deg):
+    turned = Rotation.from_euler("y", yaw_deg, degrees=True) * Rotation.from_rotvec(FACING)
+    return turned.as_rotvec().astype(np.float32)
+
+
+@pytest.mark.parametrize("yaw", [0, 20, -45, 90])
+def test_the_angle_to_the_line_of_sight(track, yaw):
+    assert off_axis_deg(replace(track, rotation=np.tile(turn(yaw), (4, 1)))) == pytest.approx(
+        abs(yaw), abs=0.05
+    )
+
+
+def test_a_face_at_the_side_of_the_picture_that_looks_at_the_camera_is_not_turned_away(track):
+    aside = np.tile(np.float32([0.6, 0, 0.6]), (4, 1))
+    looking = np.tile(turn(45), (4, 1))
+    assert off_axis_deg(replace(track, translation=aside, rotation=looking)) == pytest.approx(0, abs=0.05)

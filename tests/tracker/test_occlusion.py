@@ -1,0 +1,129 @@
+"""A textured face that moves: what covers or blurs it is told from what it does itself."""
+
+import cv2
+import numpy as np
+import pytest
+
+from tracker.head import load_head
+from tracker.landmark_indices import BLENDSHAPE_NAMES, LIPS, POINTS
+from tracker.occlusion import FaceWatch, regions
+from tracker.track import Landmarks
+
+FRAMES, SIDE = 60, 240
+FACE_PX = 700.0  # pixels a metre: the face is about 100 px wide
+
+
+def face_points() -> np.ndarray:
+    """[478, 2] px of the mean face in the middle of the picture; points that the head lacks lie on its nose."""
+    head = load_head()
+    known = head.landmark_positions(np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis)))
+    points = np.repeat(known.mean(0)[None], POINTS, axis=0)
+    points[head.landmark_embedding.landmarks] = known
+    middle = (points.max(0) + points.min(0)) / 2
+    return SIDE / 2 + FACE_PX * (points - middle)[:, :2] * [1, -1]
+
+
+POINTS_PX = face_points()
+MOUTH_PX = [
+    (POINTS_PX[list(LIPS)].min(0) - 14).round().astype(int).tolist(),
+    (POINTS_PX[list(LIPS)].max(0) + 14).round().astype(int).tolist(),
+]
+
+
+def texture(seed: int) -> np.ndarray:
+    """[SIDE, SIDE, 3] u8, blotches as large as lips and cheekbones, and pores."""
+    noise = np.random.default_rng(seed).normal(size=(SIDE, SIDE, 3))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 7)
+    return np.clip(130 + 28 * smooth / smooth.std() + 8 * noise, 0, 255).astype(np.uint8)
+
+
+def placement(frame: int) -> np.ndarray:
+    """[2, 3]: the face sways, nods and comes nearer."""
+    turn = cv2.getRotationMatrix2D(
+        (SIDE / 2, SIDE / 2), 8 * np.sin(0.2 * frame), 1 + 0.08 * np.sin(0.13 * frame)
+    )
+    turn[:, 2] += [6 * np.sin(0.11 * frame), 4 * np.cos(0.17 * frame)]
+    return turn
+
+
+def clip(covered=None, spoil=None) -> tuple[list, Landmarks]:
+    """Frames and their landmarks. covered: [T] share 0..1 of the mouth's box that a flat thing has reached."""
+    frames, points = [], np.zeros((FRAMES, POINTS, 3), np.float32)
+    own = texture(0)
+    for frame in range(FRAMES):
+        picture = own.copy()
+        if covered is not None and covered[frame] > 0:
+            (left, low), (right, high) = MOUTH_PX
+            rows = slice(round(high - covered[frame] * (high - low)), high)
+            picture[rows, left:right] = texture(7)[rows, left:right]
+        gain = 1 + 0.25 * np.sin(0.3 * frame)  # the camera adjusts its exposure
+        matrix = placement(frame)
+        picture = cv2.warpAffine(picture, matrix, (SIDE, SIDE), borderMode=cv2.BORDER_REFLECT)
+        picture = np.clip(picture * gain, 0, 255).astype(np.uint8)
+        frames.append((frame / 25, picture if spoil is None else spoil(frame, picture)))
+        points[frame, :, :2] = POINTS_PX @ matrix[:, :2].T + matrix[:, 2]
+    scores = np.zeros((FRAMES, len(BLENDSHAPE_NAMES)), np.float32)
+    time, presence = np.arange(FRAMES) / 25, np.ones(FRAMES, np.float32)
+    return frames, Landmarks(time, points, presence, scores, BLENDSHAPE_NAMES, (SIDE, SIDE))
+
+
+def look(frames, landmarks):
+    watch = FaceWatch()
+    for (_, rgb), points in zip(frames, landmarks.points):
+        watch.see(rgb, points)
+    return watch.appearance()
+
+
+def test_a_bare_face_that_moves_in_changing_light_is_itself():
+    seen = look(*clip())
+    assert seen.strangeness.max() < 0.08
+    assert seen.sharpness.min() > 0.8 and seen.sharpness.max() < 1.4
+
+
+@pytest.mark.parametrize("rise", [1, 15])
+def test_a_mouth_that_is_covered_looks_strange_whether_it_came_at_once_or_slowly(rise):
+    covered = np.clip((np.arange(FRAMES) - 25) / rise, 0, 1)
+    covered[45:] = 0
+    seen = look(*clip(covered))
+    assert seen.strangeness[covered > 0.6].min() > 0.3
+    assert seen.strangeness[covered == 0].max() < 0.08
+
+
+def test_a_blurred_frame_is_less_sharp_than_the_clip():
+    def shake(frame, picture):
+        return cv2.blur(picture, (21, 3)) if frame in (20, 21) else picture
+
+    seen = look(*clip(spoil=shake))
+    assert seen.sharpness[20:22].max() < 0.55 < 0.8 < np.delete(seen.sharpness, [20, 21]).min()
+
+
+def test_frames_without_a_face_say_nothing():
+    frames, landmarks = clip()
+    landmarks.points[10:20] = np.nan
+    seen = look(frames, landmarks)
+    assert (seen.strangeness[10:20] == 0).all() and (seen.sharpness[10:20] == 1).all()
+    landmarks.points[:] = np.nan
+    nothing = look(frames, landmarks)
+    assert (nothing.strangeness == 0).all() and (nothing.sharpness == 1).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_few_frames_are_not_called_strange(count):
+    frames, landmarks = clip()
+    landmarks.points[count:] = np.nan
+    assert look(frames, landmarks).strangeness.max() < 0.1
+
+
+def test_an_all_black_clip_is_finite():
+    frames, landmarks = clip(spoil=lambda _, picture: 0 * picture)
+    seen = look(frames, landmarks)
+    assert np.isfinite(seen.sharpness).all() and seen.strangeness.max() < 1e-6
+
+
+def test_the_regions_are_apart_and_leave_out_eyes_and_rim():
+    parts = regions(POINTS_PX)
+    together = np.concatenate(parts)
+    assert len(np.unique(together)) == len(together)
+    assert set(LIPS) <= set(parts[0].tolist())
+    assert not {159, 145, 386, 374, 10, 152, 234, 454} & set(together.tolist())
+    assert min(map(len, parts)) > 40

@@ -1,0 +1,128 @@
+"""What covers or blurs the face: how each frame's skin, lips and cheeks look against the rest of the clip.
+
+The landmarker stays sure of a mouth behind a hand or a box, and the fit follows it there. The colours under the
+landmarks do not: wherever the face turns and whatever it says, they stay near a pattern of its own, which a
+hand's, a cup's or a microphone's are not. The pattern is learned from the clip itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tracker.landmark_indices import IRIS_CENTRES, LEFT_EYE_OUTER, LIPS, OVAL, POINTS, RIGHT_EYE_OUTER
+from tracker.landmarker import crop, roi_from_points
+from tracker.track import F32, F64
+
+U8 = NDArray[np.uint8]
+
+SIDE = 128  # px of the face's crop, about 36 of them between the outer corners of the eyes
+SMOOTHING_PX = 2.0  # of the crop: colours of patches, not of pores and noise
+DARK = 8.0  # grey levels added before the logarithm: below, contrast is noise
+CONTRAST = 0.02  # of log colour: a region whose pattern is weaker than this cannot be told from another
+LEARNED = 400  # frames, spread over the clip, that the patterns are learned from
+PATTERNS = 3  # components besides the mean: a turned head, other light, an open mouth
+FRAMES_PER_PATTERN = 20  # fewer would make each frame its own pattern
+TRUSTED = 0.6  # share of the frames that are taken to show the bare face
+EYE_REACH = 0.27  # of the distance between the eyes: lids and gaze change within it and cover nothing
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """How each frame's face looks.
+
+    strangeness: [T] 0..2, 1 - correlation of the region that looks least like the face's own; 0 where no face is.
+    sharpness: [T] mean Laplacian of the face relative to its brightness, over the clip's median,
+        1 where no face is.
+    """
+
+    strangeness: F32
+    sharpness: F32
+
+
+class FaceWatch:
+    """Looks at the face of each picture while its landmarks are read; no pass over the video of its own."""
+
+    def __init__(self) -> None:
+        self._colour: list[U8] = []
+        self._place: list[NDArray[np.float16]] = []
+        self._detail: list[float] = []
+
+    def see(self, rgb: U8, points: F32) -> None:
+        """The next picture [H, W, 3] and its landmarks [478, 3] px, NaN where there is no face."""
+        if not np.isfinite(points).all():
+            self._colour.append(np.zeros((POINTS, 3), np.uint8))
+            self._place.append(np.full((POINTS, 2), np.nan, np.float16))
+            self._detail.append(np.nan)
+            return
+        roi = roi_from_points(points)
+        face = cv2.resize(crop(rgb, roi), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+        to_picture = roi.to_picture()
+        unit = np.linalg.solve(to_picture[:, :2], (points[:, :2] - to_picture[:, 2]).T).T
+        x, y = (unit * SIDE - 0.5).astype(np.float32).T[..., None]
+        smooth = cv2.GaussianBlur(face, (0, 0), SMOOTHING_PX)
+        self._colour.append(
+            cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(np.uint8)
+        )
+        self._place.append(unit.astype(np.float16))
+        self._detail.append(_detail(cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)))
+
+    def appearance(self) -> Appearance:
+        """Of the pictures seen so far; meant for when all have passed."""
+        total, detail = len(self._detail), np.array(self._detail, np.float32)
+        strangeness, sharpness = np.zeros(total, np.float32), np.ones(total, np.float32)
+        seen = np.flatnonzero(np.isfinite(detail))
+        if len(seen):
+            colour, place = np.stack(self._colour)[seen], np.stack(self._place)[seen]
+            for region in regions(np.median(place, axis=0).astype(np.float64)):
+                strangeness[seen] = np.maximum(strangeness[seen], _strangeness(colour[:, region]))
+            sharpness[seen] = detail[seen] / max(float(np.median(detail[seen])), 1e-6)
+        return Appearance(strangeness, sharpness)
+
+
+def _detail(face: U8) -> float:
+    """Mean Laplacian of a grey crop [SIDE, SIDE] over its brightness, within the face."""
+    inside = slice(SIDE // 4, -SIDE // 8), slice(SIDE // 4, -SIDE // 4)
+    edges = np.abs(cv2.Laplacian(face, cv2.CV_32F)[inside])
+    return float(edges.mean() / (face[inside].mean() + DARK))
+
+
+def regions(place: NDArray[np.floating]) -> list[NDArray[np.intp]]:
+    """Landmarks of the mouth with the chin, and of both sides of the upper face, without the eyes and the rim.
+
+    place: [478, 2], a typical face, upright, in any unit.
+    """
+    eyes = float(np.linalg.norm(place[RIGHT_EYE_OUTER] - place[LEFT_EYE_OUTER]))
+    to_iris = [np.linalg.norm(place - place[iris], axis=1) for iris in IRIS_CENTRES]
+    skin = np.minimum(*to_iris) > EYE_REACH * eyes
+    skin[list(OVAL)] = False
+    x, y = ((place - place[list(LIPS)].mean(0)) / eyes).T
+    mouth = (np.abs(x) < 0.5) & (y > -0.25) & (y < 0.4)
+    return [np.flatnonzero(skin & part) for part in (mouth, ~mouth & (x < -0.05), ~mouth & (x > 0.05))]
+
+
+def _strangeness(colour: U8) -> F64:
+    """[n] 1 - correlation of a region's colours [n, R, 3] with the nearest pattern of the face's own."""
+    logs = np.log(colour.astype(np.float64) + DARK)
+    values = (logs - logs.mean(1, keepdims=True)).reshape(len(logs), -1)
+    learned = np.unique(np.linspace(0, len(values) - 1, LEARNED).round().astype(int))
+    taken, patterns = learned, np.zeros((0, values.shape[1]))
+    mean = np.median(values[learned], axis=0)
+    for _ in range(4):
+        strange = _unlike(values[learned], mean, patterns)
+        taken = learned[np.argsort(strange, kind="stable")[: max(1, round(TRUSTED * len(learned)))]]
+        mean = values[taken].mean(0)
+        patterns = np.linalg.svd(values[taken] - mean, full_matrices=False)[2]
+        patterns = patterns[: min(PATTERNS, len(taken) // FRAMES_PER_PATTERN)]
+    return _unlike(values, mean, patterns)
+
+
+def _unlike(values: F64, mean: F64, patterns: F64) -> F64:
+    away = values - mean
+    nearest = mean + (away @ patterns.T) @ patterns
+    floor = CONTRAST**2 * values.shape[1]
+    together = (values * nearest).sum(1) + floor
+    return 1 - together / np.sqrt(((values**2).sum(1) + floor) * ((nearest**2).sum(1) + floor))
