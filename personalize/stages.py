@@ -26,7 +26,7 @@ from personalize.stage import VIDEO, Context, Stage
 from personalize.subject_data import base_path
 from personalize.tracked import read_track_of
 from tracker.camera import estimate_camera
-from tracker.confidence import judge
+from tracker.confidence import bare, judge
 from tracker.fit import fit_track
 from tracker.landmarker import track_landmarks
 from tracker.occlusion import FaceWatch
@@ -114,8 +114,11 @@ class CameraStage(Stage):
 class TrackStage(Stage):
     """One identity, and expression, pose and gaze in every frame, jointly over the clip."""
 
-    name, version = "track", 1
-    needs = ("ingest/frames.npz", "landmarks/landmarks.npz", "camera/camera.json", "camera/bundle.npz")
+    name, version = "track", 2
+    needs = (
+        *("ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
+        *("camera/camera.json", "camera/bundle.npz"),
+    )
     makes = ("track.npz",)
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -131,6 +134,7 @@ class TrackStage(Stage):
             frames.usable,
             frames.segment,
             context.report.progress,
+            evidence=bare(files.read_appearance(root / "landmarks/appearance.npz")),
         )
         files.write_track(folder / "track.npz", track)
 

@@ -43,13 +43,18 @@ def confidence(
     return np.clip(out, 0.0, 1.0)
 
 
+def bare(appearance: Appearance) -> F32:
+    """[T] 0..1, how far nothing seems to cover the face: the evidence that a fit's landmarks are."""
+    return _factor(appearance.strangeness, STRANGE, STRANGE_HALF).astype(np.float32)
+
+
 def judge(track: Track, appearance: Appearance) -> tuple[Track, list[str]]:
     """The track with its confidence lowered by what the pictures and the pose tell, and the main doubt of each frame.
 
     Doubts: `poor_fit`, `occluded`, `blurred`, `turned_away`; a frame's is the one that costs it the most.
     """
     factors = {
-        "occluded": _factor(appearance.strangeness, STRANGE, STRANGE_HALF),
+        "occluded": bare(appearance),
         "blurred": _factor(-appearance.sharpness, -SHARP, -SHARP_HALF),
         "turned_away": _factor(off_axis_deg(track), FACING_DEG, FACING_HALF_DEG),
         "poor_fit": track.confidence,

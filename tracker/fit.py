@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 KEY_FRAMES = 48
 MIN_PRESENCE = 0.5
+LEAST_EVIDENCE = 0.02  # of a covered frame: enough to hold a pose where no neighbour does
 REST_SHARE = 0.5  # of the key frames: frames at rest, which tell the neutral face
 
 Frames = NDArray[np.int64]
@@ -46,23 +48,30 @@ def fit_track(
     segment: NDArray[np.int32],
     progress: Callable[[int, int], None] | None = None,
     weights: Weights | None = None,
+    evidence: F32 | None = None,
 ) -> Track:
     """The head's identity, and expression, pose and gaze in every frame, under the given camera.
 
     bundle: not read: even the true poses, held in place of fitted ones, change the lips' error by 2-7 % only and
     landmarks moved onto them by less; it stands here for a fit that reads pictures.
     usable: [T] bool, frames that may be measured. segment: [T], number of the uninterrupted shot;
-    smoothness never crosses from one to another. Raises TrackError when no frame can be measured.
+    smoothness never crosses from one to another.
+    evidence: [T] 0..1, how far each frame's landmarks are followed, less where something covers the face: below one
+    half they tell nothing of the identity, and the frames around them tell the pose.
+    Raises TrackError when no frame can be measured.
     """
     weights = weights or Weights()
     model = landmark_model(head, weights)
     good = _measurable(landmarks, model, usable)
     observed = _undistorted(landmarks.points[good][..., :2], camera)
     energy, start = _start(model, weights, camera, observed, landmarks.points[good])
-    keys = key_frames(observed, energy.px_per_m)
-    identity = fit_identity(energy, start, keys)
+    share = np.ones(len(good)) if evidence is None else np.maximum(evidence[good], LEAST_EVIDENCE)
+    sound = np.flatnonzero(share >= min(0.5, share.max()))
+    rest, other = key_frames(observed[sound], energy.px_per_m[sound])
+    identity = fit_identity(energy, start, (sound[rest], sound[other]))
+    followed = replace(energy, visible=energy.visible * share[:, None])
     smoothness = smoothness_between(energy, landmarks.time, good, segment)
-    x, _ = solve_frames(energy, energy.shape(identity), start, smoothness, progress=progress)
+    x, _ = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
     return make_track(landmarks, camera, head, energy, observed, identity, x, good)
 
 
