@@ -139,7 +139,7 @@ class Refine(Stage):
     makes = ("track.npz", "quality.csv")
 
     def assets(self, settings: Settings) -> dict[str, str]:
-        return {"head": load_head().sha256}
+        return head_assets(settings)
 
     def make(self, context: Context, folder: Path) -> None:
         root = context.run.path
@@ -148,13 +148,13 @@ class Refine(Stage):
             files.read_track(root / "track/track.npz"),
             files.read_landmarks(root / "landmarks/landmarks.npz"),
             files.read_camera(root / "camera")[0],
-            load_head(),
+            run_head(context.settings),
             frames.segment,
             lambda: read_frames(context.run.video),
             context.report.progress,
         )
         files.write_track(folder / "track.npz", refined.track)
-        write_quality(folder / "quality.csv", refined, frames)
+        write_quality(folder / "quality.csv", refined.track, frames, refined.photometric)
 
 
 class ReadTracked(Stage):

@@ -199,7 +199,12 @@ def resume(
         strictness=np.ones(len(good)),
     )
     moved = track.expression[good].astype(np.float64), track.jaw[good].astype(np.float64)
-    return energy, np.concatenate([model.modes.of_head(*moved), rotation, translation], axis=1), observed, good
+    return (
+        energy,
+        np.concatenate([model.modes.of_head(*moved), rotation, translation], axis=1),
+        observed,
+        good,
+    )
 
 
 def make_track(
