@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from personalize.files import write_text
 from personalize.shots import Frames
-from tracker.refine import Refined
-from tracker.track import Track
+from tracker.track import F32, Track
 
 COLUMNS = (
     *("frame", "time_s", "valid", "confidence", "reprojection_px", "photometric", "lip_gap_mm"),
@@ -75,9 +74,9 @@ def left_out(time: NDArray[np.float64], reasons: NDArray[np.str_]) -> list[LeftO
     ]
 
 
-def write_quality(path: Path, refined: Refined, reasons: Sequence[str]) -> None:
-    """Write the table; `photometric` is 1 for a usual frame of the clip and empty where nothing was compared."""
-    track = refined.track
+def write_quality(path: Path, track: Track, reasons: Sequence[str], photometric: F32 | None = None) -> None:
+    """Write the table. photometric: [T], 1 in a usual frame of the clip, NaN and then empty where not compared."""
+    compared = np.full(len(track.time), np.nan, np.float32) if photometric is None else photometric
     stream = io.StringIO()
     table = csv.writer(stream, lineterminator="\n")
     table.writerow(COLUMNS)
@@ -92,7 +91,7 @@ def write_quality(path: Path, refined: Refined, reasons: Sequence[str]) -> None:
                 int(track.valid[frame]),
                 f"{track.confidence[frame]:.3f}",
                 f"{track.reprojection_px[frame]:.3f}",
-                "" if np.isnan(refined.photometric[frame]) else f"{refined.photometric[frame]:.3f}",
+                "" if np.isnan(compared[frame]) else f"{compared[frame]:.3f}",
                 f"{track.lip_gap_mm[frame]:.3f}",
                 *(f"{angle:.2f}" for angle in angles[frame]),
                 reasons[frame],

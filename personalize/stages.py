@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -30,7 +29,8 @@ from tracker.confidence import bare, judge
 from tracker.fit import fit_track
 from tracker.landmarker import track_landmarks
 from tracker.occlusion import FaceWatch
-from tracker.refine import Refined, refine_track
+from tracker.refine import refine_track
+from tracker.track import F32, Track
 
 JUDGED = ("refine/track.npz", "refine/quality.csv")
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
@@ -163,17 +163,17 @@ class Refine(Stage):
             lambda: read_frames(context.run.video),
             context.report.progress,
         )
-        write_judged(context, folder, refined)
+        write_judged(context, folder, refined.track, refined.photometric)
 
 
-def write_judged(context: Context, folder: Path, refined: Refined) -> None:
+def write_judged(context: Context, folder: Path, track: Track, photometric: F32 | None = None) -> None:
     """Write the track with its confidence lowered by what the pictures tell, and quality.csv."""
     root = context.run.path
-    judged, doubts = judge(refined.track, files.read_appearance(root / "landmarks/appearance.npz"))
+    judged, doubts = judge(track, files.read_appearance(root / "landmarks/appearance.npz"))
     frames = files.read_frames(root / "ingest/frames.npz")
     files.write_track(folder / "track.npz", judged)
     reasons = frame_reasons(frames, judged, doubts, context.settings.min_confidence)
-    write_quality(folder / "quality.csv", replace(refined, track=judged), reasons)
+    write_quality(folder / "quality.csv", judged, reasons, photometric)
 
 
 class ReadTracked(Stage):
@@ -193,8 +193,7 @@ class ReadTracked(Stage):
         frames = files.read_frames(root / "ingest/frames.npz")
         landmarks = files.read_landmarks(root / "landmarks/landmarks.npz")
         track = read_track_of(Path(str(settings.tracked)), run_head(settings), frames, landmarks)
-        unknown = np.full(len(track.time), np.nan, np.float32)
-        write_judged(context, folder, Refined(track, unknown))
+        write_judged(context, folder, track)
 
 
 class Overlay(Stage):

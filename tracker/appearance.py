@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,9 @@ Bool = NDArray[np.bool_]
 POINTS = 3000
 INSIDE = ("mouth", "teeth", "tongue", "eyes", "eyelids")  # regions that are no skin, or turn out of sight
 MOUTH_M = 0.015  # from the lips: skin that belongs to the mouth
+DENSER = (
+    8  # times as many points along the inner lips as they have vertices: their distance is that of the line
+)
 COARSE = 0.4  # of the picture's size is enough for the raster that tells what hides what
 MARGIN_M = 0.004  # how far behind the raster's surface skin may lie and still be seen
 FACING = 0.25  # cosine to the line of sight below which skin is too oblique to compare
@@ -36,7 +40,7 @@ class Skin:
     """P points on one subject's skin, in the solver's head frame (centred on the landmarks).
 
     triangles: [P] of the head's faces. barycentric: [P, 3]. rest: [P, 3] m. expression: [P, 3, K] m, the modes of
-    LandmarkModel. mouth: [P], on the lips and around them.
+    LandmarkModel. mouth: [P], on the lips and around them. to_inside: [P] m, from where the lips meet.
     """
 
     triangles: NDArray[np.int64]
@@ -44,6 +48,7 @@ class Skin:
     rest: F64
     expression: F32
     mouth: Bool
+    to_inside: F32
 
     def __len__(self) -> int:
         return len(self.rest)
@@ -66,7 +71,15 @@ def skin_of(head: HeadModel, model: LandmarkModel, identity: F32) -> Skin:
         rest=points - model.centre,
         expression=np.ascontiguousarray(moves @ model.modes.to_head.T, np.float32),
         mouth=distance < MOUTH_M,
+        to_inside=_to_line(points, [neutral[head.regions[f"inner_lip_{lip}"]] for lip in ("upper", "lower")]),
     )
+
+
+def _to_line(points: F32, lines: Sequence[F32]) -> F32:
+    """[P] m from points [P, 3] to the nearest of lines [.., 3]."""
+    share = np.linspace(0, 1, DENSER, endpoint=False)[:, None, None]
+    dense = [(line[:-1] + share * np.diff(line, axis=0)).reshape(-1, 3) for line in lines]
+    return cKDTree(np.concatenate(dense)).query(points)[0].astype(np.float32)
 
 
 def _spread(corners: F32) -> tuple[NDArray[np.int64], F32]:

@@ -18,7 +18,7 @@ class PhotometricEnergy:
     """The landmark energy of n frames, and with it the grey levels of P skin points.
 
     expected: [n, P] grey levels that the points should have. seen: [n, P] how much each counts, 0 where it is hidden.
-    noise: standard deviation of a grey level. robust: Cauchy scale in standard deviations. pull: [U] a force on
+    noise: [P] standard deviation of a grey level. robust: Cauchy scale in standard deviations. pull: [U] a force on
     every frame that is taken off: what moves all frames alike is an error of the albedo, not motion.
     """
 
@@ -27,7 +27,7 @@ class PhotometricEnergy:
     view: View
     expected: F32
     seen: F32
-    noise: float
+    noise: F32
     robust: float
     pull: F64
 
@@ -102,11 +102,11 @@ class PhotometricEnergy:
 
     def _robust(self, residual: F32) -> tuple[F64, F32]:
         """Half the Cauchy loss of each frame [n], and each point's weight [n, P] per squared grey level."""
-        c2 = np.float32((self.robust * self.noise) ** 2)
+        c2 = (np.float32(self.robust) * self.noise) ** 2
         square = residual**2 / c2
         scale = np.float32(0.5 * self.robust**2)
         loss = scale * (self.seen * np.log1p(square)).sum(1, dtype=np.float64)
-        return loss, self.seen / (np.float32(self.noise**2) * (1 + square))
+        return loss, self.seen / (self.noise**2 * (1 + square))
 
 
 @njit(cache=True)

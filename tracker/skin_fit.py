@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tracker.appearance import Skin, appearance, frame_light, harmonics, seen_skin, shaded, skin_of
+from tracker.appearance import Bool, Skin, appearance, frame_light, harmonics, seen_skin, shaded, skin_of
 from tracker.energy import POSE, Energy, rotation_matrix
 from tracker.photometric import PhotometricEnergy
 from tracker.solver import Smoothness, solve_frames
@@ -38,7 +38,11 @@ class Photometry:
     """Cauchy scale, in standard deviations of a point's grey level."""
     prior: float = 2.0
     """Factor on the landmark fit's expression prior: more evidence needs more holding of what it cannot tell."""
-    smoothness: float = 6.0
+    pair_noise_mm: float = 0.2
+    """Standard deviation of an opening between landmarks: what the lips' edges tell is not left to their colour."""
+    edge_blurs: float = 1.0
+    """Skin nearer to the mouth's inside than so many standard deviations of a blur shows teeth and dark as well."""
+    smoothness: float = 20.0
     """Factor on the landmark fit's smoothness: the skin shows motion so much finer than landmarks do."""
     steps: int = 3
     """Gauss-Newton steps at each blur."""
@@ -50,14 +54,14 @@ class Photometry:
 class Level:
     """What the skin looks like through one blur.
 
-    blur_px: sd in px of the cut pictures. albedo: [P]. light: [9], the clip's usual. noise: sd of a grey level.
+    blur_px: sd in px of the cut pictures. albedo: [P]. light: [9], the clip's usual. noise: [P], sd of a grey level.
     pull: [U], see PhotometricEnergy.
     """
 
     blur_px: float
     albedo: F32
     light: F64
-    noise: float
+    noise: F32
     pull: F64
 
 
@@ -76,14 +80,22 @@ class Subject:
     def of(cls, head: HeadModel, identity: F32, energy: Energy, photometry: Photometry) -> Subject:
         """The subject with sample points on the skin and windows around the landmarks."""
         window = Window.around(energy.observed, energy.px_per_m, photometry.finest_px_per_m)
-        energy = replace(energy, strictness=energy.strictness * photometry.prior)
+        weights = replace(energy.weights, pair_noise_mm=photometry.pair_noise_mm)
+        energy = replace(energy, weights=weights, strictness=energy.strictness * photometry.prior)
         return cls(head, identity, energy, skin_of(head, energy.model, identity), window, photometry)
+
+    @property
+    def px_per_m(self) -> float:
+        """The face's usual scale in the cut pictures."""
+        return float(np.median(self.energy.px_per_m)) * self.window.scale
 
     @property
     def blurs_px(self) -> list[float]:
         """The blurs in px of the cut pictures; those that come out alike are one."""
-        px_per_mm = 1e-3 * float(np.median(self.energy.px_per_m)) * self.window.scale
-        wanted = {max(blur * px_per_mm, self.photometry.least_blur_px) for blur in self.photometry.blurs_mm}
+        wanted = {
+            max(1e-3 * blur * self.px_per_m, self.photometry.least_blur_px)
+            for blur in self.photometry.blurs_mm
+        }
         return sorted(wanted, reverse=True)
 
     def look(self, rows: Index, x: F64) -> tuple[F32, F32]:
@@ -103,13 +115,14 @@ class Subject:
     def photometric(self, cuts: Sequence[U8], rows: Index, seen: F32, blur_px: float) -> PhotometricEnergy:
         """Energy of some frames through one blur; nothing is expected of the skin yet."""
         window = replace(self.window, origin=self.window.origin[rows])
+        skin = self.skin.to_inside * self.px_per_m > self.photometry.edge_blurs * blur_px
         return PhotometricEnergy(
             landmarks=self.energy.select(rows),
             skin=self.skin,
             view=View.blurred(cuts, window, blur_px),
             expected=np.zeros_like(seen),
-            seen=seen * np.float32(self.photometry.evidence),
-            noise=LEAST_NOISE,
+            seen=seen * skin * np.float32(self.photometry.evidence),
+            noise=np.full(len(self.skin), LEAST_NOISE, np.float32),
             robust=self.photometry.robust,
             pull=np.zeros(self.energy.model.expressions + POSE),
         )
@@ -118,16 +131,17 @@ class Subject:
 def learn_levels(subject: Subject, cuts: Sequence[U8], rows: Index, x: F64) -> list[Level]:
     """What the skin looks like through each blur, from frames `rows` at their landmark fit x [n, U].
 
-    Once and never again: an albedo that follows the fit lets the mean opening of the mouth drift.
+    A finer albedo comes from where the coarser one put the frames. Their mean stays that of the landmark fit: an
+    albedo that follows the fit freely lets the mean opening of the mouth drift.
     """
     seen, basis = subject.look(rows, x)
     levels, now = [], x
     for blur in subject.blurs_px:
         energy = subject.photometric(cuts, rows, seen, blur)
-        grey = energy.grey(x)
+        grey = energy.grey(now)
         albedo, usual = appearance(grey, basis, seen)
         expected = shaded(albedo, basis, frame_light(grey, albedo, basis, seen, usual))
-        noise = _noise((grey - expected)[seen > 0])
+        noise = _noise(grey - expected, seen > 0, subject.skin.mouth)
         energy = replace(energy, expected=expected, noise=noise)
         energy = replace(energy, pull=energy.linearize_skin(x).gradient.mean(0))
         for _ in range(subject.photometry.steadying):
@@ -136,9 +150,16 @@ def learn_levels(subject: Subject, cuts: Sequence[U8], rows: Index, x: F64) -> l
     return levels
 
 
-def _noise(error: F32) -> float:
-    """Standard deviation of grey levels by their median, which outliers do not reach."""
-    return max(1.4826 * float(np.median(np.abs(error))), LEAST_NOISE) if len(error) else LEAST_NOISE
+def _noise(error: F32, seen: Bool, mouth: Bool) -> F32:
+    """Standard deviation [P] of grey levels by the median of errors [n, P], which outliers do not reach.
+
+    Rigid skin has one in common. Around the mouth [P] it stretches, folds and gets wet as no albedo tells: each point
+    that errs more than usual has its own.
+    """
+    size = np.ma.masked_array(1.4826 * np.abs(error), ~seen)
+    usual = float(np.ma.median(size)) if seen.any() else 0.0
+    own = np.where(mouth, np.ma.median(size, axis=0).filled(0.0), 0.0)
+    return np.maximum(own, max(usual, LEAST_NOISE)).astype(np.float32)
 
 
 def _steadied(
@@ -146,14 +167,15 @@ def _steadied(
 ) -> tuple[PhotometricEnergy, F64]:
     """The energy with a pull under which the frames' mean stays that of `anchor`, and where they then go from x.
 
-    The method of multipliers on that mean: only grey levels' differences between frames are evidence.
+    The method of multipliers on that mean: only grey levels' differences between frames are evidence. Half steps:
+    bounds and other frames' stiffness make whole ones overshoot.
     """
     shape = subject.energy.shape(subject.identity.astype(np.float64))
     alone = Smoothness.between(np.arange(len(x)), np.zeros(x.shape[1]))
     x, _ = solve_frames(energy, shape, x, alone, steps=subject.photometry.steps)
     drift = (x - anchor).mean(0)
     stiffness = energy.linearize(shape, x).hessian.mean(0)
-    return replace(energy, pull=energy.pull - stiffness @ drift), x
+    return replace(energy, pull=energy.pull - 0.5 * stiffness @ drift), x
 
 
 def fit_stretch(
@@ -174,7 +196,7 @@ def fit_stretch(
 def _expected(grey: F32, level: Level, basis: F32, seen: F32) -> F32:
     """[n, P] under the light of each frame, which what covers the skin must not dim."""
     light = frame_light(grey, level.albedo, basis, seen, level.light)
-    error = (grey - shaded(level.albedo, basis, light)) / np.float32(3 * level.noise)
+    error = (grey - shaded(level.albedo, basis, light)) / (3 * level.noise)
     light = frame_light(grey, level.albedo, basis, seen / (1 + error**2), level.light)
     return shaded(level.albedo, basis, light)
 

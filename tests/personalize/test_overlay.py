@@ -19,7 +19,6 @@ from tests.personalize.video_factory import clicks, write_video
 from tests.tracker.turning_head import picture, shifted_landmarks, turning_track
 from tracker.head import load_head
 from tracker.overlay import MODES
-from tracker.refine import Refined
 
 FRAMES, LEFT_OUT = 6, 4
 
@@ -96,9 +95,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     write_landmarks(run.path / "landmarks/landmarks.npz", shifted_landmarks(track, head, 0))
     track = dataclasses.replace(track, valid=valid, confidence=confidence)
     write_track(run.path / "refine/track.npz", track)
-    unknown = np.full(FRAMES, np.nan, np.float32)
     reasons = ["ok" if used else "blurred" for used in valid]
-    write_quality(run.path / "refine/quality.csv", Refined(track, unknown), reasons)
+    write_quality(run.path / "refine/quality.csv", track, reasons)
     return run
 
 

@@ -11,7 +11,6 @@ from personalize.quality import frame_reasons, left_out, read_reasons, write_qua
 from personalize.shots import REASONS, Frames
 from tests.personalize.test_registration import track_of
 from tracker.head import load_head
-from tracker.refine import Refined
 
 TIME = np.arange(6) / 25
 DOUBTS = ["occluded", "occluded", "blurred", "poor_fit", "poor_fit", "poor_fit"]
@@ -39,7 +38,7 @@ def test_the_first_reason_counts(frames, track):
 def test_quality_csv_carries_the_reasons(frames, track, tmp_path: Path):
     reasons = frame_reasons(frames, track, DOUBTS, 0.5)
     photometric = np.array([np.nan, np.nan, 3, 1.5, 1, 0.5], np.float32)
-    write_quality(tmp_path / "quality.csv", Refined(track, photometric), reasons)
+    write_quality(tmp_path / "quality.csv", track, reasons, photometric)
     assert read_reasons(tmp_path / "quality.csv").tolist() == reasons
     rows = list(csv.DictReader((tmp_path / "quality.csv").open(newline="")))
     assert [row["photometric"] for row in rows] == ["", "", "3.000", "1.500", "1.000", "0.500"]

@@ -51,7 +51,7 @@ def energy_and_x() -> tuple[PhotometricEnergy, np.ndarray]:
         view=View(grey, window),
         expected=rng.uniform(60, 180, (frames, len(skin))).astype(np.float32),
         seen=(rng.uniform(size=(frames, len(skin))) > 0.3).astype(np.float32),
-        noise=20.0,
+        noise=rng.uniform(15, 25, len(skin)).astype(np.float32),
         robust=2.0,
         pull=rng.normal(size=x.shape[1]),
     )
