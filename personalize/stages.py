@@ -106,7 +106,7 @@ class CameraStage(Stage):
 class TrackStage(Stage):
     """One identity, and expression, pose and gaze in every frame, jointly over the clip."""
 
-    name, version = "track", 1
+    name, version = "track", 2
     needs = ("ingest/frames.npz", "landmarks/landmarks.npz", "camera/camera.json", "camera/bundle.npz")
     makes = ("track.npz",)
 

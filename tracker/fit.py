@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from tracker.confidence import confidence
 from tracker.energy import (
+    LIP_PAIRS,
     POSE,
     Energy,
     LandmarkModel,
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 KEY_FRAMES = 48
 MIN_PRESENCE = 0.5
 REST_SHARE = 0.5  # of the key frames: frames at rest, which tell the neutral face
+LIP_BIAS = 0.001  # m
 
 Frames = NDArray[np.int64]
 
@@ -58,6 +61,7 @@ def fit_track(
     observed = _undistorted(landmarks.points[good][..., :2], camera)
     energy, start = _start(model, weights, camera, observed, landmarks.points[good])
     keys = key_frames(observed, energy.px_per_m)
+    energy = with_lips_shut(energy, start, keys[0])
     identity = fit_identity(energy, start, keys)
     x = fit_frames(energy, start, identity, landmarks.time[good], _runs(good, segment), progress)
     return _track(landmarks, camera, head, energy, observed, identity, x, good)
@@ -132,6 +136,28 @@ def key_frames(observed: F64, px_per_m: F64) -> tuple[Frames, Frames]:
     other = np.setdiff1d(np.arange(n), rest)
     spread = np.linspace(0, len(other) - 1, min(count - len(rest), len(other))).round().astype(int)
     return rest, other[spread]
+
+
+def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
+    """The energy whose inner-lip landmarks are, on shut lips, as far apart as in the frames at rest that are most shut.
+
+    The landmarker keeps the lips of a shut mouth apart, on each face by its own amount; what exceeds LIP_BIAS is taken
+    for an open mouth. x: [n, P], of which the rotations are read.
+    """
+    model = energy.model
+    named = model.landmarks[model.pairs]
+    lips = np.isin(named, [index for pair in LIP_PAIRS for index in pair]).all(1)
+    upper, lower = model.pairs[lips].T
+    up = rotation_matrix(x[rest, -6:-3])[:, :2, 1] * energy.px_per_m[rest, None]
+    apart = energy.observed[rest][:, upper] - energy.observed[rest][:, lower]
+    height = np.einsum("nqi,ni->nq", apart, up) / (up**2).sum(1, keepdims=True)
+    shut = np.argsort(height.mean(1), kind="stable")[: max(1, len(rest) // 2)]
+    bias = np.clip(np.median(height[shut], axis=0) - model.touch[lips], -LIP_BIAS, LIP_BIAS)
+    mean, touch = model.mean.copy(), model.touch.copy()
+    mean[upper, 1] += bias / 2
+    mean[lower, 1] -= bias / 2
+    touch[lips] += bias
+    return replace(energy, model=replace(model, mean=mean, touch=touch))
 
 
 def fit_identity(energy: Energy, start: F64, keys: tuple[Frames, Frames]) -> F64:
