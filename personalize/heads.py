@@ -16,7 +16,7 @@ from personalize.restricted_pickle import read_pickle
 from personalize.settings import Settings
 from personalize.user_arrays import read_user_npz
 from tracker.flame import ARRAYS, SurfacePoints, flame_head
-from tracker.head import HeadModel, load_head
+from tracker.head import ASSET, HeadModel, load_head
 from tracker.landmark_indices import IBUG_51
 from tracker.track import TrackError
 
@@ -38,7 +38,10 @@ def run_head(settings: Settings) -> HeadModel:
 def head_assets(settings: Settings) -> dict[str, str]:
     """The head by content, for the keys of the stages that use it."""
     if settings.head is None:
-        return {"head": load_head().sha256}
+        return {
+            "head": load_head().sha256,
+            "head_embedding": sha256_file(ASSET.with_suffix(".landmarks.npz")),
+        }
     path, embedding = _files(settings)
     run_head(settings)  # says what is missing
     masks = path.parent / MASKS

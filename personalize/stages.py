@@ -89,7 +89,7 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 1, ("focal_px",)
+    name, version, reads = "camera", 2, ("focal_px",)
     needs = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz")
     makes = ("camera.json", "bundle.npz")
 
@@ -162,6 +162,7 @@ class Refine(Stage):
             files.read_frames(root / "ingest/frames.npz").segment,
             lambda: read_frames(context.run.video),
             context.report.progress,
+            evidence=bare(files.read_appearance(root / "landmarks/appearance.npz")),
         )
         write_judged(context, folder, refined.track, refined.photometric)
 

@@ -109,13 +109,25 @@ def settle(head: HeadModel, places: F64) -> tuple[NDArray[np.int32], F64]:
 
 
 def embed(head: HeadModel, landmarks: NDArray[np.int32], places: F64) -> LandmarkEmbedding:
-    """The nearest places on the right part of the surface: irises on the eyeballs, everything else on the skin."""
-    irises = np.isin(landmarks, RIGHT_IRIS + LEFT_IRIS)
+    """The nearest places on the right part of the surface: irises on the eyeballs, everything else on the skin.
+
+    The lips touch, so the nearest place may be the other lip's: each inner lip stays with the faces on its own edge.
+    """
     balls = np.isin(head.faces, head.regions["eyes"]).all(1)
     inside = np.concatenate([head.regions[name] for name in ("eyes", "teeth", "tongue", "mouth")])
     skin = ~np.isin(head.faces, np.setdiff1d(inside, head.regions["lower_lip_edge"])).any(1)
+    upper, lower = (
+        np.isin(head.faces, head.regions[f"{lip}_lip_edge"][1:-1]).any(1) for lip in ("upper", "lower")
+    )
+    parts = {
+        RIGHT_IRIS + LEFT_IRIS: balls,
+        INNER_UPPER[1:-1]: skin & upper & ~lower,
+        INNER_LOWER[1:-1]: skin & lower & ~upper,
+    }
+    rest = tuple(np.setdiff1d(landmarks, np.concatenate(list(parts))))
     triangles, shares = np.zeros(len(landmarks), np.int32), np.zeros((len(landmarks), 3), np.float32)
-    for members, allowed in ((irises, balls), (~irises, skin)):
+    for points, allowed in (parts | {rest: skin}).items():
+        members = np.isin(landmarks, points)
         triangles[members], shares[members] = _nearest(head, np.flatnonzero(allowed), places[members])
     return LandmarkEmbedding(landmarks, triangles, shares, head.sha256)
 

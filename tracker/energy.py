@@ -65,6 +65,8 @@ class Weights:
     """Standard deviation of a jaw joint's opening, rad."""
     jaw_side_sd: float = 0.02
     """The same of its turn to the side."""
+    contact_mm: float = 0.15
+    """Standard deviation of how far lips, or lids, pass through each other."""
     rest: float = 30.0
     """Factor on the expression prior in frames at rest: identity, not expression, explains them."""
     acceleration: tuple[float, float, float] = (0.2, 0.005, 0.001)
@@ -76,7 +78,7 @@ class LandmarkModel:
     """The head at its L fitted landmarks, centred. landmarks: [L] of the 478. pairs: [Q, 2] into L.
 
     mean [L, 3], identity [Ki, L, 3], expression [K, L, 3] (the modes) and centre [3] in m, head frame;
-    normals [L, 3].
+    normals [L, 3]. touch: [Q] m, the height of a pair's upper landmark above the lower one at which skin meets skin.
     """
 
     landmarks: NDArray[np.int32]
@@ -86,12 +88,18 @@ class LandmarkModel:
     centre: F64
     normals: F64
     pairs: NDArray[np.int64]
+    touch: F64
     modes: Modes
 
     @property
     def expressions(self) -> int:
         """Number of modes."""
         return len(self.modes)
+
+    def heights(self, points: F64) -> F64:
+        """[.., Q] of each pair's upper landmark above its lower one, of points or movements [.., L, 3]."""
+        upper, lower = self.pairs.T
+        return points[..., upper, 1] - points[..., lower, 1]
 
 
 def landmark_model(head: HeadModel, weights: Weights) -> LandmarkModel:
@@ -107,20 +115,25 @@ def landmark_model(head: HeadModel, weights: Weights) -> LandmarkModel:
         return np.einsum("lc,...lcx->...lx", share, np.asarray(field, np.float64)[..., corners, :])
 
     mean = at(head.template)
+    expression = np.tensordot(modes.to_head, at(movements(head)), axes=1)
     row = {int(index): i for i, index in enumerate(embedding.landmarks[keep])}
     pairs = [pair for pair in (*LIP_PAIRS, *LID_PAIRS) if row.keys() >= set(pair)]
     side = np.asarray(head.template, np.float64)[corners]
     normal = np.cross(side[:, 1] - side[:, 0], side[:, 2] - side[:, 0])
-    return LandmarkModel(
+    model = LandmarkModel(
         landmarks=embedding.landmarks[keep].astype(np.int32),
         mean=mean - mean.mean(0),
         identity=at(head.identity_basis),
-        expression=np.tensordot(modes.to_head, at(movements(head)), axes=1),
+        expression=expression,
         centre=mean.mean(0),
         normals=normal / np.linalg.norm(normal, axis=1, keepdims=True),
         pairs=np.array([(row[a], row[b]) for a, b in pairs], int).reshape(-1, 2),
+        touch=np.zeros(len(pairs)),
         modes=modes,
     )
+    # A head of named shapes is built to be shut, lips and lids, at rest with both blinks at 1.
+    blinks = [i for i, name in enumerate(head.expression_names) if name.startswith("eyeBlink")]
+    return model if head.signed else replace(model, touch=model.heights(mean + expression[blinks].sum(0)))
 
 
 def rotation_matrix(rotation: F64) -> F64:
@@ -197,7 +210,8 @@ class Energy:
     def value(self, shape: F64, x: F64) -> F64:
         """[n] the energy at x [n, P] of the subject with landmarks `shape` [L, 3] at rest."""
         residual, _ = self._residuals(self._points(shape, x)[1])
-        return self._robust(residual)[0].sum(1) + self._prior(x)[0]
+        contact = 0.5 * (self._overlap(shape, x) ** 2).sum(1)
+        return self._robust(residual)[0].sum(1) + self._prior(x)[0] + contact
 
     def project(self, shape: F64, x: F64) -> F64:
         """[n, L, 2] px of the landmarks."""
@@ -230,7 +244,11 @@ class Energy:
         w = np.arange(-POSE - model.expressions, -POSE)
         gradient[:, w] += slope_w
         hessian[:, w, w] += curve
-        return Quadratic(value.sum(1) + prior, gradient, hessian)
+        overlap = self._overlap(shape, x)
+        lift = model.heights(moves) * (1e3 / self.weights.contact_mm)
+        gradient[:, :-POSE] += overlap @ lift.T
+        hessian[:, :-POSE, :-POSE] += (lift * (overlap < 0)[:, None]) @ lift.T
+        return Quadratic(value.sum(1) + prior + 0.5 * (overlap**2).sum(1), gradient, hessian)
 
     def _points(self, shape: F64, x: F64) -> tuple[F64, F64]:
         face = shape + np.tensordot(x[:, :-POSE], self.model.expression, axes=1)
@@ -265,6 +283,12 @@ class Energy:
         seen = np.concatenate([self.visible, self.visible[:, pairs].min(2)], axis=1) * self.weights.evidence
         square = (residual**2).sum(-1) / c2
         return 0.5 * c2 * seen * np.log1p(square), seen / (1 + square)
+
+    def _overlap(self, shape: F64, x: F64) -> F64:
+        """[n, Q] <= 0: how far the skin of each pair passes through the other's, in standard deviations."""
+        model = self.model
+        height = model.heights(shape) + x[:, :-POSE] @ model.heights(model.expression)
+        return np.minimum(height - model.touch, 0.0) * (1e3 / self.weights.contact_mm)
 
     def _prior(self, x: F64) -> tuple[F64, F64, F64]:
         """Prior of the expression weights: value [n], gradient and curvature [n, Ke]."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tracker.confidence import confidence
 from tracker.energy import (
+    LIP_PAIRS,
     POSE,
     Energy,
     LandmarkModel,
@@ -25,6 +26,7 @@ from tracker.energy import (
     visibility,
 )
 from tracker.gaze import eye_rotations
+from tracker.rigid_pose import hold_poses
 from tracker.solver import Smoothness, solve_frames, solve_subject
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track, TrackError
 
@@ -35,6 +37,7 @@ KEY_FRAMES = 48
 MIN_PRESENCE = 0.5
 LEAST_EVIDENCE = 0.02  # of a covered frame: enough to hold a pose where no neighbour does
 REST_SHARE = 0.5  # of the key frames: frames at rest, which tell the neutral face
+LIP_BIAS = 0.001  # m
 
 Frames = NDArray[np.int64]
 
@@ -52,8 +55,7 @@ def fit_track(
 ) -> Track:
     """The head's identity, and expression, pose and gaze in every frame, under the given camera.
 
-    bundle: not read: even the true poses, held in place of fitted ones, change the lips' error by 2-7 % only and
-    landmarks moved onto them by less; it stands here for a fit that reads pictures.
+    bundle: its poses take the place of the landmarks' own where the focal length is known, from it or given.
     usable: [T] bool, frames that may be measured. segment: [T], number of the uninterrupted shot;
     smoothness never crosses from one to another.
     evidence: [T] 0..1, how far each frame's landmarks are followed, less where something covers the face: below one
@@ -65,14 +67,22 @@ def fit_track(
     good = _measurable(landmarks, model, usable)
     observed = _undistorted(landmarks.points[good][..., :2], camera)
     energy, start = _start(model, weights, camera, observed, landmarks.points[good])
-    share = np.ones(len(good)) if evidence is None else np.maximum(evidence[good], LEAST_EVIDENCE)
+    share = _share(evidence, good)
     sound = np.flatnonzero(share >= min(0.5, share.max()))
-    rest, other = key_frames(observed[sound], energy.px_per_m[sound])
-    identity = fit_identity(energy, start, (sound[rest], sound[other]))
+    rest, other = (sound[rows] for rows in key_frames(observed[sound], energy.px_per_m[sound]))
+    energy = with_lips_shut(energy, start, rest)
+    identity = fit_identity(energy, start, (rest, other))
     followed = replace(energy, visible=energy.visible * share[:, None])
     smoothness = smoothness_between(energy, landmarks.time, good, segment)
     x, _ = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
+    if camera.method != "prior":
+        x = hold_poses(x, bundle, good, _runs(good, segment))
     return make_track(landmarks, camera, head, energy, observed, identity, x, good)
+
+
+def _share(evidence: F32 | None, good: Frames) -> F64:
+    """[n] how far the landmarks of the frames `good` are followed."""
+    return np.ones(len(good)) if evidence is None else np.maximum(evidence[good], LEAST_EVIDENCE)
 
 
 def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.bool_]) -> Frames:
@@ -155,6 +165,28 @@ def key_frames(observed: F64, px_per_m: F64) -> tuple[Frames, Frames]:
     return rest, other[spread]
 
 
+def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
+    """The energy whose inner-lip landmarks are, on shut lips, as far apart as in the frames at rest that are most shut.
+
+    The landmarker keeps the lips of a shut mouth apart, on each face by its own amount; what exceeds LIP_BIAS is taken
+    for an open mouth. x: [n, P], of which the rotations are read.
+    """
+    model = energy.model
+    named = model.landmarks[model.pairs]
+    lips = np.isin(named, [index for pair in LIP_PAIRS for index in pair]).all(1)
+    upper, lower = model.pairs[lips].T
+    up = rotation_matrix(x[rest, -6:-3])[:, :2, 1] * energy.px_per_m[rest, None]
+    apart = energy.observed[rest][:, upper] - energy.observed[rest][:, lower]
+    height = np.einsum("nqi,ni->nq", apart, up) / (up**2).sum(1, keepdims=True)
+    shut = np.argsort(height.mean(1), kind="stable")[: max(1, len(rest) // 2)]
+    bias = np.clip(np.median(height[shut], axis=0) - model.touch[lips], -LIP_BIAS, LIP_BIAS)
+    mean, touch = model.mean.copy(), model.touch.copy()
+    mean[upper, 1] += bias / 2
+    mean[lower, 1] -= bias / 2
+    touch[lips] += bias
+    return replace(energy, model=replace(model, mean=mean, touch=touch))
+
+
 def fit_identity(energy: Energy, start: F64, keys: tuple[Frames, Frames]) -> F64:
     """[Ki] the subject, from frames at rest, whose expressions are held near zero, and from others."""
     rest, other = keys
@@ -183,13 +215,13 @@ def smoothness_between(
 
 
 def resume(
-    track: Track, landmarks: Landmarks, camera: Camera, head: HeadModel, weights: Weights | None = None
+    track: Track, landmarks: Landmarks, camera: Camera, head: HeadModel, evidence: F32 | None = None
 ) -> tuple[Energy, F64, F64, Frames]:
-    """Where a track stands, the inverse of `make_track`, for its n valid frames.
+    """Where a track stands, the inverse of `make_track`, for its n valid frames. evidence: see `fit_track`.
 
     Returns energy, unknowns x [n, P], all landmarks [n, 478, 2] px without distortion, and the frames [n].
     """
-    weights = weights or Weights()
+    weights = Weights()
     model = landmark_model(head, weights)
     finite = np.isfinite(landmarks.points[:, model.landmarks]).all(axis=(1, 2))
     good = np.flatnonzero(track.valid & finite)
@@ -204,16 +236,14 @@ def resume(
         principal=np.array(camera.principal_px, np.float64),
         observed=observed[:, model.landmarks],
         px_per_m=camera.focal_px / translation[:, 2],
-        visible=visibility(model, rotation, translation),
+        visible=visibility(model, rotation, translation) * _share(evidence, good)[:, None],
         strictness=np.ones(len(good)),
     )
     moved = track.expression[good].astype(np.float64), track.jaw[good].astype(np.float64)
-    return (
-        energy,
-        np.concatenate([model.modes.of_head(*moved), rotation, translation], axis=1),
-        observed,
-        good,
-    )
+    x = np.concatenate([model.modes.of_head(*moved), rotation, translation], axis=1)
+    if len(good):
+        energy = with_lips_shut(energy, x, key_frames(observed, energy.px_per_m)[0])
+    return energy, x, observed, good
 
 
 def make_track(

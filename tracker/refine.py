@@ -43,15 +43,16 @@ def refine_track(
     frames: Callable[[], Iterable[Frame]],
     progress: Callable[[int, int], None] | None = None,
     photometry: Photometry | None = None,
+    evidence: F32 | None = None,
 ) -> Refined:
     """Expression, pose and gaze of the valid frames again, with the pictures; identity and camera stay.
 
     segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
     each row of the landmarks; it is called twice. A frame whose skin does not come nearer to what it should look
-    like keeps its landmark fit, and so does one whose picture is missing.
+    like keeps its landmark fit, and so does one whose picture is missing. evidence: see `fit_track`.
     """
     photometry = photometry or Photometry()
-    energy, x, observed, good = resume(track, landmarks, camera, head)
+    energy, x, observed, good = resume(track, landmarks, camera, head, evidence)
     unknown = np.full(len(track.time), np.nan, np.float32)
     if not len(good):
         return Refined(track, unknown)

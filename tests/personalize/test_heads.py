@@ -24,7 +24,9 @@ def settings(path: Path, embedding: Path | None = None) -> Settings:
 
 def test_without_a_file_the_embedded_head_is_used() -> None:
     assert run_head(Settings()) is load_head()
-    assert head_assets(Settings()) == {"head": load_head().sha256}
+    assets = head_assets(Settings())
+    assert assets["head"] == load_head().sha256
+    assert set(assets) == {"head", "head_embedding"}
     with pytest.raises(UserError, match="belongs to a --head"):
         run_head(Settings(head_embedding="a.npz"))
 

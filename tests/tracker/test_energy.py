@@ -35,6 +35,7 @@ def random_model(seed: int = 0) -> LandmarkModel:
         centre=np.array([0.0, 0.03, 0.08]),
         normals=np.tile([0.0, 0.0, 1.0], (POINTS, 1)),
         pairs=np.array([[0, 1], [2, 3]]),
+        touch=np.array([0.02, -0.08]),
         modes=random_modes(),
     )
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tracker.energy import LIP_PAIRS, Weights, landmark_model
 from tracker.fit import fit_track
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, INNER_LIP_LOWER, POINTS
@@ -117,6 +118,32 @@ def test_lips_pose_and_opening_are_found(talker, track):
     assert turn_error_deg(track, talker.rotation).mean() < 1.0
     assert np.abs(track.translation - talker.translation).max() < 0.05
     assert track.reprojection_px.mean() < 3 * NOISE * 0.09 * FOCAL / DISTANCE
+
+
+def test_shut_lips_read_shut_though_the_landmarker_keeps_them_apart():
+    talker = Talker(150, seed=2, noise=0.001)
+    points = talker.landmarks.points.copy()
+    apart = 0.0007 * FOCAL / DISTANCE  # px
+    points[:, [upper for upper, _ in LIP_PAIRS], 1] -= apart / 2
+    points[:, [lower for _, lower in LIP_PAIRS], 1] += apart / 2
+    track = talker.fit(landmarks=replace(talker.landmarks, points=points))
+    shut = talker.gap < 0.05
+    assert shut.sum() > 10
+    assert np.median(track.lip_gap_mm[shut]) < 0.3
+    assert np.sqrt(np.mean((track.lip_gap_mm - talker.gap) ** 2)) < 0.6
+
+
+def test_lips_and_lids_do_not_pass_each_other():
+    model = landmark_model(HEAD, Weights())
+    talker = Talker(60, seed=4)
+    points = talker.landmarks.points.copy()
+    upper, lower = model.landmarks[model.pairs].T
+    points[:, upper, 1] += 0.002 * FOCAL / DISTANCE
+    points[:, lower, 1] -= 0.002 * FOCAL / DISTANCE
+    track = talker.fit(landmarks=replace(talker.landmarks, points=points))
+    shape = model.mean + np.tensordot(track.identity, model.identity, axes=1)
+    face = shape + np.tensordot(track.expression, model.expression, axes=1)
+    assert (model.heights(face) - model.touch).min() > -2e-4
 
 
 def test_gaze_follows_the_irises(talker, track):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tracker.energy import LIP_PAIRS
 from tracker.head import ASSET, HeadModel, load_head, read_head
 from tracker.track import TrackError
 
@@ -211,3 +212,13 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
     path.write_bytes(ASSET.read_bytes())
     with pytest.raises(TrackError, match="not a landmark embedding"):
         load_head(path)
+
+
+def test_the_inner_lips_landmarks_lie_each_on_its_own_lip():
+    head = load_head()
+    row = {int(index): i for i, index in enumerate(head.landmark_embedding.landmarks)}
+    jaw = np.zeros(len(head.expression_names))
+    jaw[head.expression_names.index("jawOpen")] = 0.5
+    open_mouth = head.landmark_positions(np.zeros(len(head.identity_basis)), jaw)
+    for upper, lower in LIP_PAIRS:
+        assert open_mouth[row[upper], 1] - open_mouth[row[lower], 1] > 0.004
