@@ -34,7 +34,7 @@ LENS_BLUR_PX = 0.6
 SHININESS = 12.0
 SHORT_PX = 0.5  # a movement during the exposure that blurs nothing
 LOWER_TEETH = 0.35  # of their colour: the mesh's row is a plate that would pass for a lip
-IN_MOUTH = 0.4  # share of the key light
+IN_MOUTH = 0.25  # share of the key light
 HAND_COLOUR = (205.0, 165.0, 148.0)
 MADE_BY = (
     *(module.__file__ for module in (ground_truth, props, rendered_heads, raster, video_writer)),

@@ -22,7 +22,11 @@ from tracker.track import F64
 FPS = 25.0
 WAVES, BEND_LENGTH_M, WARP_LENGTH_M = 24, 0.05, 0.04
 FACE_DEPTH_M = 0.085  # of the face before the head's origin
-TURN_S, TURN_BACK_S, TURN_RISE_S = 2.5, 3.5, 0.2  # of the fast head turn: when, when back, how long it takes
+TURN_S, TURN_BACK_S, TURN_RISE_S = (
+    2.5,
+    2.74,
+    0.2,
+)  # of the fast head turn: when, when back, how long each takes
 Colour = tuple[float, float, float]
 
 
@@ -35,7 +39,7 @@ class Scene:
     seconds: float = 6.0
     bend_mm: float = 1.2
     """Rms over the face of the neutral's departure from the head model."""
-    warp: float = 0.3
+    warp: float = 0.22
     """Rms of the expressions' warp, as a share of a vertex's movement."""
     size: tuple[int, int] = (640, 640)
     focal: float = 1.3
@@ -96,7 +100,7 @@ SCENES = (
         focal=1.15,
         head=0.6,
         speech_start_s=25.0,
-        skin=(0.5, 0.42, 0.38),
+        skin=(0.62, 0.54, 0.50),
         hair=(0.06, 0.05, 0.05),
         hand=True,
         ambient=0.55,

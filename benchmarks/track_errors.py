@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from kornia.geometry import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
+from scipy.ndimage import binary_closing
 from scipy.spatial import cKDTree
 from scipy.stats import rankdata
 from torch import from_numpy
@@ -30,25 +31,28 @@ Similarity = tuple[float, F64, F64]
 
 
 def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, float]:
-    """Errors by name: mm, degrees, frames, shares, or r for correlations; NaN where the clip cannot tell."""
+    """Errors by name: mm, degrees, frames, shares, or r for correlations; NaN where the clip cannot tell.
+
+    Frames in which something covers the lips count for confidence and recovery alone.
+    """
     fitted = axis_angle_to_rotation_matrix(from_numpy(track.rotation.astype(np.float64))).numpy()
+    judged = track.valid & (truth.covered <= COVERED)
     resting = np.zeros(len(head.expression_names), np.float32)
     neutral = head.vertices(track.identity, resting).astype(np.float64)
     mean = head.template.astype(np.float64)
     surface, frame = surface_error(neutral, track, fitted, head, truth)
     errors = {"surface_mm": surface, "mean_surface_mm": surface_error(mean, track, fitted, head, truth)[0]}
     if truth.vertices is not None:
-        errors |= face_errors(neutral, track, fitted, head, truth)
+        errors |= face_errors(neutral, track, fitted, judged, head, truth)
         frame = similarity(neutral[truth.vertices], truth.neutral)
-    errors |= lip_errors(neutral, frame, track, head, truth)
-    errors |= opening_errors(track.lip_gap_mm.astype(np.float64) * frame[0], truth.lip_gap_mm, track.valid)
-    seen = track.valid
+    errors |= lip_errors(neutral, frame, track, judged, head, truth)
+    errors |= opening_errors(track.lip_gap_mm.astype(np.float64) * frame[0], truth.lip_gap_mm, judged)
     return errors | {
-        "rotation_deg": rotation_error(fitted[seen], truth.rotation[seen]),
+        "rotation_deg": rotation_error(fitted[judged], truth.rotation[judged]),
         "focal_pct": 100 * (track.focal / truth.focal - 1),
         "turn_deg": turn(truth.rotation),
         "confidence_auc": separation(track.confidence, truth.covered > COVERED),
-        "unseen_pct": 100 * float(1 - seen.mean()),
+        "unseen_pct": 100 * float(1 - track.valid.mean()),
     }
 
 
@@ -64,7 +68,7 @@ def surface_error(
 
 
 def face_errors(
-    neutral: F64, track: Track, fitted: F64, head: HeadModel, truth: GroundTruth
+    neutral: F64, track: Track, fitted: F64, judged: Bool, head: HeadModel, truth: GroundTruth
 ) -> dict[str, float]:
     """Errors of the face's vertices, for the same mesh.
 
@@ -73,7 +77,7 @@ def face_errors(
     frame. recovery_frames: after what disturbed the view, until the face in the picture is back within RECOVERED times
     the clip's median.
     """
-    face, seen = truth.vertices, np.flatnonzero(track.valid)
+    face, seen = truth.vertices, np.flatnonzero(judged)
     moves = head.expression_basis[:, face].astype(np.float64)
     found = neutral[face] + np.tensordot(track.expression, moves, axes=1)
     true = truth.neutral + truth.displacement
@@ -98,12 +102,12 @@ def face_errors(
 
 
 def lip_errors(
-    neutral: F64, frame: Similarity, track: Track, head: HeadModel, truth: GroundTruth
+    neutral: F64, frame: Similarity, track: Track, judged: Bool, head: HeadModel, truth: GroundTruth
 ) -> dict[str, float]:
     """Errors of the lips' vertices: about the mean over time (in all, in the face's plane, in depth), and against the
     neutral; `jitter_mm` is the mean second difference of the error over frames that follow each other.
     """
-    lips, seen = head.regions["lips"], np.flatnonzero(track.valid)
+    lips, seen = head.regions["lips"], np.flatnonzero(judged)
     scale, turned, shift = frame
     if truth.vertices is None:
         partner = _partners(scale * neutral @ turned.T + shift, head.faces, truth)[lips]
@@ -125,17 +129,17 @@ def lip_errors(
     }
 
 
-def opening_errors(gap: F64, true: F64, valid: Bool) -> dict[str, float]:
-    """Lip opening [T] mm against the truth, over valid frames; closures over all."""
-    error = (gap - true)[valid]
-    moves = float(true[valid].std()) > 0.1
-    closed = true[valid] < CLOSED_MM
+def opening_errors(gap: F64, true: F64, judged: Bool) -> dict[str, float]:
+    """Lip opening [T] mm against the truth, over the judged frames [T]."""
+    error = (gap - true)[judged]
+    moves = float(true[judged].std()) > 0.1
+    closed = true[judged] < CLOSED_MM
     return {
-        "opening_r": float(np.corrcoef(gap[valid], true[valid])[0, 1]) if moves else np.nan,
+        "opening_r": float(np.corrcoef(gap[judged], true[judged])[0, 1]) if moves else np.nan,
         "opening_rmse_mm": float(np.sqrt(np.mean(error**2))),
         "opening_centred_mm": float(error.std()),
         "closed_mm": float(np.median(error[closed])) if closed.any() else np.nan,
-        "closures": closures_reached(np.where(valid, gap, np.inf), true),
+        "closures": closures_reached(gap, np.where(judged, true, np.nan)),
     }
 
 
@@ -164,7 +168,8 @@ def disturbed(truth: GroundTruth) -> Bool:
     """[T] frames in which the lips are covered or the head turns fast."""
     step = truth.rotation[1:] @ truth.rotation[:-1].transpose(0, 2, 1)
     fast = np.concatenate([[False], _angle_deg(step) > FAST_DEG])
-    return fast | (truth.covered > COVERED)
+    seen = fast | (truth.covered > COVERED)
+    return seen | binary_closing(seen, iterations=2)  # a turn's far end belongs to it
 
 
 def recovery_frames(error: F64, disturbed: Bool) -> float:

@@ -10,6 +10,7 @@ from benchmarks.ground_truth import GroundTruth
 from benchmarks.track_errors import (
     closures_reached,
     compare,
+    disturbed,
     opening_errors,
     recovery_frames,
     separation,
@@ -171,3 +172,22 @@ def test_similarity_is_found_exactly() -> None:
     np.testing.assert_allclose(found, turned, atol=1e-9)
     np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-9)
     assert similarity(source, 2 * source, scaled=False)[0] == 1
+
+
+def test_covered_frames_do_not_count(exact: tuple[Track, GroundTruth], head: HeadModel) -> None:
+    track, truth = exact
+    covered = (np.arange(FRAMES) == 4).astype(float)
+    gap, moved = truth.lip_gap_mm.copy(), truth.displacement.copy()
+    gap[4] += 9
+    moved[4] += 0.01
+    errors = compare(track, head, replace(truth, covered=covered, lip_gap_mm=gap, displacement=moved))
+    for name in ("opening_rmse_mm", "lip_motion_mm", "jitter_mm", "face_scaled_mm"):
+        assert errors[name] == pytest.approx(0, abs=0.01), name
+
+
+def test_a_turn_there_and_back_is_one_disturbance(exact: tuple[Track, GroundTruth]) -> None:
+    _, truth = exact
+    angle = np.array([0, 0, 0, 8, 20, 30, 31, 30, 20, 8, 0, 0])[:, None]
+    turns = Rotation.from_euler("y", angle, degrees=True).as_matrix()
+    found = disturbed(replace(truth, rotation=turns))
+    np.testing.assert_array_equal(np.flatnonzero(found), np.arange(3, 11))
