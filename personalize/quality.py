@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from personalize.files import write_text
 from personalize.shots import Frames
-from tracker.track import Track
+from tracker.track import F32, Track
 
 COLUMNS = (
     *("frame", "time_s", "valid", "confidence", "reprojection_px", "photometric", "lip_gap_mm"),
@@ -40,8 +40,9 @@ def frame_reason(frames: Frames, track: Track, frame: int) -> str:
     return reason if reason != "ok" else "no_face"
 
 
-def write_quality(path: Path, track: Track, frames: Frames) -> None:
-    """Write the table; `photometric` stays empty where no photometric stage has run."""
+def write_quality(path: Path, track: Track, frames: Frames, photometric: F32 | None = None) -> None:
+    """Write the table. photometric: [T], 1 in a usual frame of the clip, NaN and then empty where not compared."""
+    compared = np.full(len(track.time), np.nan, np.float32) if photometric is None else photometric
     stream = io.StringIO()
     table = csv.writer(stream, lineterminator="\n")
     table.writerow(COLUMNS)
@@ -56,7 +57,7 @@ def write_quality(path: Path, track: Track, frames: Frames) -> None:
                 int(track.valid[frame]),
                 f"{track.confidence[frame]:.3f}",
                 f"{track.reprojection_px[frame]:.3f}",
-                "",
+                "" if np.isnan(compared[frame]) else f"{compared[frame]:.3f}",
                 f"{track.lip_gap_mm[frame]:.3f}",
                 *(f"{angle:.2f}" for angle in angles[frame]),
                 frame_reason(frames, track, frame),

@@ -27,6 +27,7 @@ from personalize.tracked import read_track_of
 from tracker.camera import estimate_camera
 from tracker.fit import fit_track
 from tracker.landmarker import track_landmarks
+from tracker.refine import refine_track
 
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
 
@@ -128,16 +129,32 @@ class TrackStage(Stage):
 
 
 class Refine(Stage):
-    """Photometric refinement: for now the landmark track as it is, and quality.csv from what there is."""
+    """The track again, with the grey levels of the skin; quality.csv."""
 
-    name, version = "refine", 1
-    needs, makes = ("ingest/frames.npz", "track/track.npz"), ("track.npz", "quality.csv")
+    name, version = "refine", 2
+    needs = (
+        *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz"),
+        *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),
+    )
+    makes = ("track.npz", "quality.csv")
+
+    def assets(self, settings: Settings) -> dict[str, str]:
+        return head_assets(settings)
 
     def make(self, context: Context, folder: Path) -> None:
         root = context.run.path
-        track = files.read_track(root / "track/track.npz")
-        files.write_track(folder / "track.npz", track)
-        write_quality(folder / "quality.csv", track, files.read_frames(root / "ingest/frames.npz"))
+        frames = files.read_frames(root / "ingest/frames.npz")
+        refined = refine_track(
+            files.read_track(root / "track/track.npz"),
+            files.read_landmarks(root / "landmarks/landmarks.npz"),
+            files.read_camera(root / "camera")[0],
+            run_head(context.settings),
+            frames.segment,
+            lambda: read_frames(context.run.video),
+            context.report.progress,
+        )
+        files.write_track(folder / "track.npz", refined.track)
+        write_quality(folder / "quality.csv", refined.track, frames, refined.photometric)
 
 
 class ReadTracked(Stage):

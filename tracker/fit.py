@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import torch
+from kornia.geometry import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
 
 from tracker.confidence import confidence
@@ -59,8 +61,9 @@ def fit_track(
     energy, start = _start(model, weights, camera, observed, landmarks.points[good])
     keys = key_frames(observed, energy.px_per_m)
     identity = fit_identity(energy, start, keys)
-    x = fit_frames(energy, start, identity, landmarks.time[good], _runs(good, segment), progress)
-    return _track(landmarks, camera, head, energy, observed, identity, x, good)
+    smoothness = smoothness_between(energy, landmarks.time, good, segment)
+    x, _ = solve_frames(energy, energy.shape(identity), start, smoothness, progress=progress)
+    return make_track(landmarks, camera, head, energy, observed, identity, x, good)
 
 
 def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.bool_]) -> Frames:
@@ -79,11 +82,20 @@ def _undistorted(points: NDArray[np.floating], camera: Camera) -> F64:
     flat = points.astype(np.float64)
     if not len(camera.distortion):
         return flat
+    matrix, lens = _lens(camera)
+    return cv2.undistortPoints(flat.reshape(-1, 1, 2), matrix, lens, P=matrix).reshape(flat.shape)
+
+
+def undistorted_picture(rgb: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """A picture as a camera without distortion would see it."""
+    return cv2.undistort(rgb, *_lens(camera)) if len(camera.distortion) else rgb
+
+
+def _lens(camera: Camera) -> tuple[F64, F64]:
+    """OpenCV's camera matrix [3, 3] and distortion [5]."""
     k1, k2, k3 = (*camera.distortion, 0.0, 0.0)[:3]
     (cx, cy), f = camera.principal_px, camera.focal_px
-    matrix = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]])
-    lens = np.array([k1, k2, 0.0, 0.0, k3])
-    return cv2.undistortPoints(flat.reshape(-1, 1, 2), matrix, lens, P=matrix).reshape(flat.shape)
+    return np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]]), np.array([k1, k2, 0.0, 0.0, k3])
 
 
 def _start(
@@ -149,24 +161,53 @@ def _runs(good: Frames, segment: NDArray[np.int32]) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(broken)])
 
 
-def fit_frames(
-    energy: Energy,
-    start: F64,
-    identity: F64,
-    time: F64,
-    run: NDArray[np.int64],
-    progress: Callable[[int, int], None] | None = None,
-) -> F64:
-    """[n, P] expression and pose of every frame of a subject that is known."""
-    interval = float(np.median(np.diff(time))) if len(time) > 1 else 0.04
+def smoothness_between(
+    energy: Energy, time: F64, good: Frames, segment: NDArray[np.int32], factor: float = 1.0
+) -> Smoothness:
+    """Smoothness of the measured frames `good` of a clip, inside its shots. time, segment: [T]. factor: on it."""
+    step = np.diff(time[good])
+    interval = float(np.median(step)) if len(step) else 0.04
     sd = np.repeat(energy.weights.acceleration, (energy.model.expressions, 3, 3))
     # The integral of white noise bends by the power 1.5 of the interval.
-    precision = 1.0 / (sd * (interval / 0.04) ** 1.5) ** 2
-    smoothness = Smoothness.between(run, precision)
-    return solve_frames(energy, energy.shape(identity), start, smoothness, progress=progress)[0]
+    precision = factor / (sd * (interval / 0.04) ** 1.5) ** 2
+    return Smoothness.between(_runs(good, segment), precision)
 
 
-def _track(
+def resume(
+    track: Track, landmarks: Landmarks, camera: Camera, head: HeadModel, weights: Weights | None = None
+) -> tuple[Energy, F64, F64, Frames]:
+    """Where a track stands, the inverse of `make_track`, for its n valid frames.
+
+    Returns energy, unknowns x [n, P], all landmarks [n, 478, 2] px without distortion, and the frames [n].
+    """
+    weights = weights or Weights()
+    model = landmark_model(head, weights)
+    finite = np.isfinite(landmarks.points[:, model.landmarks]).all(axis=(1, 2))
+    good = np.flatnonzero(track.valid & finite)
+    observed = _undistorted(landmarks.points[good][..., :2], camera)
+    turn = torch.from_numpy(track.rotation[good].astype(np.float64))
+    matrix = axis_angle_to_rotation_matrix(turn).numpy()
+    rotation, translation = rotation_vector(matrix), track.translation[good] + matrix @ model.centre
+    energy = Energy(
+        model=model,
+        weights=weights,
+        focal=camera.focal_px,
+        principal=np.array(camera.principal_px, np.float64),
+        observed=observed[:, model.landmarks],
+        px_per_m=camera.focal_px / translation[:, 2],
+        visible=visibility(model, rotation, translation),
+        strictness=np.ones(len(good)),
+    )
+    moved = track.expression[good].astype(np.float64), track.jaw[good].astype(np.float64)
+    return (
+        energy,
+        np.concatenate([model.modes.of_head(*moved), rotation, translation], axis=1),
+        observed,
+        good,
+    )
+
+
+def make_track(
     landmarks: Landmarks,
     camera: Camera,
     head: HeadModel,

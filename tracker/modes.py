@@ -46,6 +46,11 @@ class Modes:
         both = weights @ self.to_head
         return np.clip(both[..., :-3], *self.expression_range), both[..., -3:]
 
+    def of_head(self, expression: F64, jaw: F64) -> F64:
+        """[.., K] the inverse of `head_weights`, within the bounds."""
+        weights = np.concatenate([expression, jaw], axis=-1) @ np.linalg.pinv(self.to_head)
+        return np.clip(weights, self.lower, self.upper)
+
 
 def head_modes(head: HeadModel, weights: Weights) -> Modes:
     """The modes of a head. Raises TrackError for one of named shapes that lacks ARKit's jaw."""

@@ -5,17 +5,37 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from tracker.energy import POSE, Energy, Quadratic
+from tracker.energy import POSE, Energy, LandmarkModel, Quadratic
 from tracker.track import F64
 
 ROUNDS = 4  # of fixing what passes a bound
 GIVE_UP = 1e6  # damping at which no step can help
 CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
+
+
+class FrameEnergy(Protocol):
+    """The energy of n frames that `solve_frames` minimizes."""
+
+    @property
+    def model(self) -> LandmarkModel:
+        """The head, whose modes have bounds."""
+
+    def select(self, frames: slice) -> Self:
+        """That of some of the frames."""
+
+    def value(self, shape: F64, x: F64) -> F64:
+        """[n] at x [n, P] of the subject with landmarks `shape` [L, 3] at rest."""
+
+    def linearize(self, shape: F64, x: F64) -> Quadratic:
+        """Gauss-Newton model at x [n, P]."""
+
+
 Progress = Callable[[int, int], None]
 Step = tuple[F64, F64]  # of the identity [Ki] and of the frames [n, P]
 
@@ -169,7 +189,7 @@ class Smoothness:
 
 
 def solve_frames(
-    energy: Energy,
+    energy: FrameEnergy,
     shape: F64,
     x: F64,
     smoothness: Smoothness,
@@ -207,7 +227,7 @@ def solve_frames(
     return x, value
 
 
-def _bounds(energy: Energy) -> Bounds:
+def _bounds(energy: FrameEnergy) -> Bounds:
     return Bounds(energy.model.modes.lower, energy.model.modes.upper)
 
 
@@ -215,7 +235,7 @@ def _chunks(n: int) -> list[slice]:
     return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
 
 
-def _linearize(energy: Energy, shape: F64, x: F64) -> tuple[F64, F64]:
+def _linearize(energy: FrameEnergy, shape: F64, x: F64) -> tuple[F64, F64]:
     gradient, hessian = np.empty(x.shape), np.empty((*x.shape, x.shape[1]))
     for part in _chunks(len(x)):
         quadratic = energy.select(part).linearize(shape, x[part])

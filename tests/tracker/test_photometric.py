@@ -1,0 +1,127 @@
+"""The photometric energy's derivatives, and reading pictures between pixels."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tracker.appearance import HARMONICS, appearance, frame_light, harmonics, shaded, skin_of
+from tracker.energy import POSE, Energy, Weights, landmark_model
+from tracker.head import load_head
+from tracker.photometric import PhotometricEnergy
+from tracker.view import View, Window
+
+HEAD = load_head()
+MODEL = landmark_model(HEAD, Weights())
+IDENTITY = np.zeros(len(HEAD.identity_basis), np.float32)
+FOCAL, SIZE = 900.0, (400, 400)
+
+
+def saddle(size: tuple[int, int], twist: float) -> np.ndarray:
+    """A picture [h, w] that bilinear interpolation reproduces, without a kink between pixels."""
+    y, x = np.mgrid[: size[1], : size[0]].astype(np.float32) / 100
+    return 40 + 30 * x + 20 * y + twist * x * y
+
+
+@pytest.fixture(scope="module")
+def energy_and_x() -> tuple[PhotometricEnergy, np.ndarray]:
+    rng = np.random.default_rng(0)
+    frames = 2
+    x = np.zeros((frames, MODEL.expressions + POSE))
+    x[:, :-POSE] = rng.uniform(0.05, 0.3, (frames, MODEL.expressions))
+    x[:, -6:-3] = rng.normal(size=(frames, 3)) * 0.15
+    x[:, -3:] = [0.005, -0.004, 0.7]
+    landmarks = Energy(
+        model=MODEL,
+        weights=Weights(),
+        focal=FOCAL,
+        principal=np.array([320.0, 240.0]),
+        observed=np.zeros((frames, len(MODEL.mean), 2)),
+        px_per_m=np.full(frames, FOCAL / 0.7),
+        visible=np.ones((frames, len(MODEL.mean))),
+        strictness=np.ones(frames),
+    )
+    landmarks.observed[:] = landmarks.project(MODEL.mean, x) + rng.normal(size=landmarks.observed.shape)
+    window = Window(np.array([[70.0, -10.0], [72.0, -11.0]]), 0.8, SIZE)
+    grey = np.stack([saddle(SIZE, twist) for twist in (15.0, -12.0)])
+    skin = skin_of(HEAD, MODEL, IDENTITY)
+    energy = PhotometricEnergy(
+        landmarks=landmarks,
+        skin=skin,
+        view=View(grey, window),
+        expected=rng.uniform(60, 180, (frames, len(skin))).astype(np.float32),
+        seen=(rng.uniform(size=(frames, len(skin))) > 0.3).astype(np.float32),
+        noise=rng.uniform(15, 25, len(skin)).astype(np.float32),
+        robust=2.0,
+        pull=rng.normal(size=x.shape[1]),
+    )
+    return energy, x
+
+
+def test_gradient_matches_finite_differences(energy_and_x):
+    energy, x = energy_and_x
+    analytic = energy.linearize(MODEL.mean, x)
+    np.testing.assert_allclose(analytic.value, energy.value(MODEL.mean, x), rtol=1e-6)
+    for column in range(x.shape[1]):
+        step = np.zeros(x.shape[1])
+        step[column] = 1e-3 if column < MODEL.expressions else 1e-4
+        ends = [energy.value(MODEL.mean, x + sign * step) for sign in (1, -1)]
+        numeric = (ends[0] - ends[1]) / (2 * step[column])
+        np.testing.assert_allclose(analytic.gradient[:, column], numeric, rtol=5e-3, atol=0.5)
+
+
+def test_hessian_is_that_of_the_rows_of_seen_points(energy_and_x):
+    energy, x = energy_and_x
+    blind = replace(energy, seen=np.zeros_like(energy.seen))
+    skin = energy.linearize_skin(x)
+    np.testing.assert_allclose(skin.hessian, skin.hessian.transpose(0, 2, 1), rtol=1e-5, atol=1e-3)
+    assert np.linalg.eigvalsh(skin.hessian).min() > -1e-3 * np.abs(skin.hessian).max()
+    assert not blind.linearize_skin(x).hessian.any()
+    assert not blind.linearize_skin(x).gradient.any()
+
+
+def test_view_reads_a_ramp_exactly_and_is_flat_outside():
+    ramp = (3 * np.arange(40)[None, :] + 2 * np.arange(30)[:, None]).astype(np.float32)
+    view = View(ramp[None], Window(np.array([[100.0, 50.0]]), 0.5, (40, 30)))
+    inside, outside = [120.3, 71.7], [90.0, 60.0]
+    value, slope = view.read(np.array([[inside, outside]]))
+    place = (np.array(inside) - [100, 50] + 0.5) * 0.5 - 0.5
+    np.testing.assert_allclose(value[0, 0], 3 * place[0] + 2 * place[1], rtol=1e-5)
+    np.testing.assert_allclose(slope[0], [[1.5, 1.0], [0.0, 0.0]], rtol=1e-5)
+
+
+def test_window_cuts_what_lies_outside_as_its_border():
+    rgb = np.zeros((20, 30, 3), np.uint8)
+    rgb[:, :2] = 200
+    inside = Window(np.array([[-6.0, 4.0]]), 1.0, (10, 8)).cut(rgb, 0)
+    assert inside.shape == (8, 10)
+    assert (inside[:, :8] == 200).all() and (inside[:, 8:] == 0).all()
+    assert Window(np.array([[500.0, -90.0]]), 0.5, (10, 8)).cut(rgb, 0).shape == (8, 10)
+
+
+def test_light_and_albedo_explain_what_they_made():
+    rng = np.random.default_rng(1)
+    normals = rng.normal(size=(6, 500, 3)).astype(np.float32)
+    normals[..., 2] = -np.abs(normals[..., 2]) - 0.5
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    basis = harmonics(normals)
+    light = np.tile([120.0, 10, -20, -30, 5, 3, 0, 4, 2], (6, 1)) * rng.uniform(0.8, 1.2, (6, 1))
+    grey = shaded(rng.uniform(0.5, 1.0, 500).astype(np.float32), basis, light)
+    covered = grey.copy()
+    covered[0, :40] = 250
+    seen = np.ones_like(grey)
+    albedo, usual = appearance(covered, basis, seen)
+    found = shaded(albedo, basis[1:], frame_light(covered[1:], albedo, basis[1:], seen[1:], usual))
+    assert light.shape == (6, HARMONICS)
+    assert np.abs(found - grey[1:]).mean() < 1.5
+
+
+def test_sample_points_lie_on_skin_alone():
+    skin = skin_of(HEAD, MODEL, IDENTITY)
+    corners = np.unique(HEAD.faces[skin.triangles])
+    for name in ("eyes", "teeth", "tongue"):
+        assert not np.isin(corners, HEAD.regions[name]).any()
+    assert np.isin(corners, HEAD.regions["lips"]).any()
+    assert (skin.barycentric >= 0).all()
+    np.testing.assert_allclose(skin.barycentric.sum(1), 1, rtol=1e-5)
+    assert 0.1 < skin.mouth.mean() < 0.7

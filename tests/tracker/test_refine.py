@@ -1,0 +1,173 @@
+"""Closed loop: a rendered head with known parameters -> landmarks with noise -> fit -> refine -> error."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tracker.fit import fit_track, make_track, resume
+from tracker.head import load_head
+from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
+from tracker.raster import render
+from tracker.refine import _stretches, refine_track
+from tracker.track import Bundle, Camera, Landmarks, Track
+
+HEAD = load_head()
+NAMES = list(HEAD.expression_names)
+SIZE, FOCAL, DISTANCE, FRAMES = (320, 320), 460.0, 0.5, 24
+CAMERA = Camera(FOCAL, 0.0, (159.5, 159.5), (), SIZE, "given", "")
+NO_BUNDLE = Bundle(
+    np.zeros(0, np.int32), *(np.zeros((0, 3), np.float32) for _ in range(3)), np.zeros((0, 4), np.float32)
+)
+
+
+def freckled() -> np.ndarray:
+    """[D, 3] u8: something to hold on to, as skin has."""
+    mottle = np.random.default_rng(5).uniform(0.75, 1.0, (len(HEAD.template), 1))
+    return (HEAD.albedo * mottle).astype(np.uint8)
+
+
+@dataclass
+class Film:
+    pictures: list[np.ndarray]
+    landmarks: Landmarks
+    rotation: np.ndarray
+    gap: np.ndarray
+    track: Track
+
+    def frames(self):
+        return iter([(n / 25, picture) for n, picture in enumerate(self.pictures)])
+
+    def refine(self, pictures=None, landmarks=None, track=None):
+        film = replace(self, pictures=self.pictures if pictures is None else pictures)
+        segment = np.zeros(len(self.landmarks.time), np.int32)
+        return refine_track(
+            track or self.track, landmarks or self.landmarks, CAMERA, HEAD, segment, film.frames
+        )
+
+
+@pytest.fixture(scope="module")
+def film() -> Film:
+    rng = np.random.default_rng(0)
+    t = np.arange(FRAMES) / 25
+    expression = np.zeros((FRAMES, len(NAMES)), np.float32)
+    for name, size, hertz in (("jawOpen", 0.3, 3.0), ("mouthFunnel", 0.3, 2.0), ("browInnerUp", 0.4, 1.0)):
+        expression[:, NAMES.index(name)] = size * np.clip(np.sin(2 * np.pi * hertz * t), 0, 1)
+    turn = Rotation.from_rotvec(np.radians([3.0, 10.0, 2.0]) * np.sin(np.outer(t, [3.0, 2.0, 4.0])))
+    rotation = turn.as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    translation = np.array([0, 0, DISTANCE]) - rotation @ HEAD.template.mean(0)
+    identity = np.zeros(len(HEAD.identity_basis), np.float32)
+    person = np.broadcast_to(identity, (FRAMES, len(identity)))
+    vertices = HEAD.vertices(person, expression)
+    posed = (vertices @ rotation.transpose(0, 2, 1) + translation[:, None]).astype(np.float32)
+    albedo = freckled()
+    pictures = [render(one, HEAD.faces, albedo, FOCAL, (159.5, 159.5), SIZE) for one in posed]
+    noisy = [np.clip(p + rng.normal(size=p.shape) * 2, 0, 255).astype(np.uint8) for p in pictures]
+    seen = HEAD.landmark_positions(person, expression) @ rotation.transpose(0, 2, 1) + translation[:, None]
+    pixels = FOCAL * seen[..., :2] / seen[..., 2:] + 159.5
+    # Neighbouring landmarks err together: a field of waves over the face, another one in every frame.
+    direction, phase = rng.normal(size=(FRAMES, 6, 2)), rng.uniform(0, 6, (FRAMES, 6))
+    wave = np.sin(np.einsum("nlx,nkx->nlk", pixels / 40, direction) + phase[:, None])
+    pixels = pixels + 0.5 * np.einsum("nlk,nkx->nlx", wave, rng.normal(size=(FRAMES, 6, 2)))
+    points = np.zeros((FRAMES, POINTS, 3), np.float32)
+    points[:, HEAD.landmark_embedding.landmarks] = np.dstack([pixels, seen[..., 2] * FOCAL / DISTANCE])
+    scores = np.zeros((FRAMES, len(BLENDSHAPE_NAMES)), np.float32)
+    landmarks = Landmarks(t, points, np.ones(FRAMES, np.float32), scores, BLENDSHAPE_NAMES, SIZE)
+    usable, segment = np.ones(FRAMES, bool), np.zeros(FRAMES, np.int32)
+    track = fit_track(landmarks, CAMERA, NO_BUNDLE, HEAD, usable, segment)
+    return Film(noisy, landmarks, rotation, np.asarray(HEAD.lip_gap_mm(vertices)), track)
+
+
+def turn_error_deg(track: Track, truth: np.ndarray) -> float:
+    difference = Rotation.from_rotvec(track.rotation) * Rotation.from_matrix(truth).inv()
+    return float(np.degrees((difference.mean().inv() * difference).magnitude()).mean())
+
+
+def opening_error_mm(track: Track, truth: np.ndarray) -> float:
+    return float((track.lip_gap_mm - truth).std())
+
+
+def test_resume_is_the_inverse_of_make_track(film: Film):
+    energy, x, observed, good = resume(film.track, film.landmarks, CAMERA, HEAD)
+    identity = film.track.identity.astype(np.float64)
+    again = make_track(film.landmarks, CAMERA, HEAD, energy, observed, identity, x, good)
+    for name in ("expression", "rotation", "translation", "lip_gap_mm"):
+        np.testing.assert_allclose(getattr(again, name), getattr(film.track, name), atol=1e-5)
+
+
+def test_pictures_lower_the_error(film: Film):
+    refined = film.refine()
+    assert turn_error_deg(refined.track, film.rotation) < 0.7 * turn_error_deg(film.track, film.rotation)
+    assert opening_error_mm(refined.track, film.gap) < 0.8 * opening_error_mm(film.track, film.gap)
+    np.testing.assert_array_equal(refined.track.identity, film.track.identity)
+    assert np.nanmedian(refined.photometric) == pytest.approx(1, abs=1e-5)
+
+
+def test_a_covered_mouth_loses_confidence(film: Film):
+    pictures = [picture.copy() for picture in film.pictures]
+    low = film.landmarks.points[10:13, [61, 291, 17], :2].mean((0, 1)).astype(int)
+    for picture in pictures[10:13]:
+        cv2.rectangle(picture, (low - 35).tolist(), (low + 35).tolist(), (250, 240, 230), -1)
+    trust = film.refine(pictures).track.confidence
+    assert trust[10:13].max() < 0.5 * np.delete(trust, [10, 11, 12]).min()
+
+
+def test_black_frames_keep_the_landmark_fit(film: Film):
+    refined = film.refine([np.zeros_like(picture) for picture in film.pictures])
+    np.testing.assert_allclose(refined.track.expression, film.track.expression, atol=1e-5)
+    assert np.isfinite(refined.track.rotation).all()
+
+
+def test_one_frame(film: Film):
+    one = slice(0, 1)
+    landmarks = replace(
+        film.landmarks,
+        **{
+            name: getattr(film.landmarks, name)[one] for name in ("time", "points", "presence", "blendshapes")
+        },
+    )
+    fields = ("time", "valid", "confidence", "expression", "jaw", "neck", "eyes", "rotation", "translation")
+    fields += ("lip_gap_mm", "reprojection_px")
+    track = replace(film.track, **{name: getattr(film.track, name)[one] for name in fields})
+    refined = refine_track(
+        track, landmarks, CAMERA, HEAD, np.zeros(1, np.int32), lambda: iter([(0.0, film.pictures[0])])
+    )
+    assert np.isfinite(refined.track.expression).all()
+    assert refined.photometric.shape == (1,)
+
+
+def test_no_valid_frame_gives_the_track_back(film: Film):
+    track = replace(film.track, valid=np.zeros(FRAMES, bool))
+    refined = film.refine(track=track)
+    assert refined.track is track
+    assert np.isnan(refined.photometric).all()
+
+
+def test_missing_pictures_keep_the_landmark_fit(film: Film):
+    refined = film.refine(film.pictures[:12])
+    np.testing.assert_allclose(refined.track.rotation[12:], film.track.rotation[12:], atol=1e-5)
+    assert np.isnan(refined.photometric[12:]).all()
+    assert np.isfinite(refined.photometric[:12]).all()
+
+
+def test_a_face_that_leaves_the_frame_stays_finite(film: Film):
+    away = film.landmarks.points.copy()
+    away[16:, :, 0] += 400
+    landmarks = replace(film.landmarks, points=away)
+    refined = film.refine(landmarks=landmarks)
+    assert np.isfinite(refined.track.expression).all() and np.isfinite(refined.track.translation).all()
+    gone = replace(film.track, valid=np.arange(FRAMES) < 16)
+    refined = film.refine(track=gone)
+    np.testing.assert_array_equal(refined.track.valid, gone.valid)
+    assert (refined.track.confidence[16:] == 0).all()
+
+
+@pytest.mark.parametrize("total", [1, 119, 120, 128, 129, 248, 300])
+def test_stretches_cover_every_frame_once(total: int):
+    covered = []
+    for start, held in _stretches(((row, np.zeros(0, np.uint8)) for row in range(total)), total):
+        assert min(held) == max(0, start - 8) and max(held) == min(total, start + 128) - 1
+        covered += [row for row in held if start <= row < start + 120]
+    assert covered == list(range(total))

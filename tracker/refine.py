@@ -1,0 +1,118 @@
+"""Refine a clip's landmark track by the grey levels of the skin, in bounded memory: one stretch at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracker.confidence import TOLERATED
+from tracker.fit import make_track, resume, smoothness_between, undistorted_picture
+from tracker.skin_fit import Photometry, Subject, fit_stretch, learn_levels
+from tracker.track import F32, F64, Camera, Landmarks, Track
+from tracker.view import U8, Index
+
+if TYPE_CHECKING:
+    from tracker.head import HeadModel
+
+KEYS = 64  # frames, spread over the clip, that tell the albedo
+STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
+Frame = tuple[float, U8]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A track, and how far its skin is from what it should look like.
+
+    photometric: [T] mean deviation of the grey levels, 1 in the clip's median; NaN where nothing was compared.
+    """
+
+    track: Track
+    photometric: F32
+
+
+def refine_track(
+    track: Track,
+    landmarks: Landmarks,
+    camera: Camera,
+    head: HeadModel,
+    segment: NDArray[np.int32],
+    frames: Callable[[], Iterable[Frame]],
+    progress: Callable[[int, int], None] | None = None,
+    photometry: Photometry | None = None,
+) -> Refined:
+    """Expression, pose and gaze of the valid frames again, with the pictures; identity and camera stay.
+
+    segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
+    each row of the landmarks; it is called twice. A frame whose skin does not come nearer to what it should look
+    like keeps its landmark fit, and so does one whose picture is missing.
+    """
+    photometry = photometry or Photometry()
+    energy, x, observed, good = resume(track, landmarks, camera, head)
+    unknown = np.full(len(track.time), np.nan, np.float32)
+    if not len(good):
+        return Refined(track, unknown)
+    subject = Subject.of(head, track.identity, energy, photometry)
+    wanted = np.unique(np.linspace(0, len(good) - 1, KEYS).round().astype(int))
+    keys = dict(_cuts(subject, camera, frames(), good[wanted], wanted))
+    if not keys:
+        return Refined(track, unknown)
+    rows = np.array(list(keys))
+    levels = learn_levels(subject, list(keys.values()), rows, x[rows])
+    deviation = np.full((len(good), 2), np.nan)
+    refined = x.copy()
+    for start, cuts in _stretches(_cuts(subject, camera, frames(), good, np.arange(len(good))), len(good)):
+        rows = np.array(list(cuts))
+        smoothness = smoothness_between(energy, landmarks.time, good[rows], segment, photometry.smoothness)
+        found, before, after = fit_stretch(subject, levels, list(cuts.values()), rows, x[rows], smoothness)
+        better = np.isfinite(found).all(1) & (after[:, 0] < before[:, 0])
+        own = (rows >= start) & (rows < start + STRETCH)
+        refined[rows[own & better]] = found[own & better]
+        deviation[rows[own]] = np.where(better[:, None], after, before)[own]
+        if progress:
+            progress(min(start + STRETCH, len(good)), len(good))
+    out = make_track(
+        landmarks, camera, head, energy, observed, track.identity.astype(np.float64), refined, good
+    )
+    return _judged(out, deviation, good, unknown)
+
+
+def _cuts(
+    subject: Subject, camera: Camera, frames: Iterable[Frame], wanted: Index, rows: Index
+) -> Iterator[tuple[int, U8]]:
+    """Row and cut-out face of each frame wanted [n], in order. rows: [n] of the subject's windows."""
+    row_of = dict(zip(wanted.tolist(), rows.tolist()))
+    for frame, (_, rgb) in enumerate(frames):
+        if frame in row_of:
+            yield row_of[frame], subject.window.cut(undistorted_picture(rgb, camera), row_of[frame])
+
+
+def _stretches(cuts: Iterable[tuple[int, U8]], total: int) -> Iterator[tuple[int, dict[int, U8]]]:
+    """First row of each stretch, and the cut-outs of it and of the frames that it overlaps."""
+    held: dict[int, U8] = {}
+    start = 0
+    for row, cut in cuts:
+        held[row] = cut
+        if row + 1 >= min(start + STRETCH + OVERLAP, total):
+            yield start, held
+            start += STRETCH
+            held = {row: cut for row, cut in held.items() if row >= start - OVERLAP}
+    if any(row >= start for row in held):
+        yield start, held
+
+
+def _judged(track: Track, deviation: F64, good: Index, unknown: F32) -> Refined:
+    """The track with less confidence where the skin, or the mouth's alone, looks other than usual: covered, blurred.
+
+    deviation: [n, 2] of the frames `good`.
+    """
+    usual = np.maximum(np.nanmedian(deviation, axis=0), 1e-9) if np.isfinite(deviation).any() else np.ones(2)
+    ratio = deviation / usual
+    excess = np.maximum(np.nan_to_num(ratio, nan=0.0).max(1) - TOLERATED, 0.0)
+    confidence, photometric = track.confidence.copy(), unknown.copy()
+    confidence[good] *= np.exp(-excess).astype(np.float32)
+    photometric[good] = ratio[:, 0]
+    return Refined(replace(track, confidence=confidence), photometric)

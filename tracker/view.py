@@ -1,0 +1,105 @@
+"""Pictures cut around the face at a scale of their own, blurred, and read between pixels with their slope."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tracker.track import F32, F64
+
+U8 = NDArray[np.uint8]
+Index = NDArray[np.int64]
+Rows = slice | Sequence[int] | Index
+
+MARGIN = 1.15  # of the extent of the face's landmarks
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where the face lies in each of n pictures: q of the whole picture is at (q - origin + 1/2) * scale - 1/2.
+
+    origin: [n, 2] px of the whole picture, whole numbers. scale: at most 1. size: (width, height) of what is cut out.
+    """
+
+    origin: F64
+    scale: float
+    size: tuple[int, int]
+
+    @classmethod
+    def around(cls, observed: F64, px_per_m: F64, finest_px_per_m: float) -> Window:
+        """Windows of one size around landmarks [n, L, 2] px, shrunk to `finest_px_per_m` in the clip's median."""
+        low, high = observed.min(1), observed.max(1)
+        scale = min(1.0, finest_px_per_m / float(np.median(px_per_m)))
+        size = np.ceil((high - low).max(0) * MARGIN * scale).astype(int)
+        origin = np.floor((low + high) / 2 - size / scale / 2)
+        return cls(origin, scale, (int(size[0]), int(size[1])))
+
+    def cut(self, rgb: U8, row: int) -> U8:
+        """[height, width] u8 grey; outside of the picture its border goes on."""
+        low = self.origin[row].astype(int)
+        high = low + [round(side / self.scale) for side in self.size]
+        limit = np.array(rgb.shape[1::-1])
+        first, last = np.clip(low, 0, limit - 1), np.clip(high, 1, limit)
+        last = np.maximum(last, first + 1)
+        grey = cv2.cvtColor(rgb[first[1] : last[1], first[0] : last[0]], cv2.COLOR_RGB2GRAY)
+        if (missing := np.concatenate([first - low, high - last])).any():
+            left, top, right, bottom = np.maximum(missing, 0)
+            grey = cv2.copyMakeBorder(grey, top, bottom, left, right, cv2.BORDER_REPLICATE)
+        return cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
+
+    def principal(self, principal: F64, row: int) -> F64:
+        """[2] px, the principal point in one cut picture."""
+        return (principal - self.origin[row] + 0.5) * self.scale - 0.5
+
+
+@dataclass(frozen=True)
+class View:
+    """n cut pictures through one blur, [n, h, w] f32 grey levels."""
+
+    grey: F32
+    window: Window
+
+    @classmethod
+    def blurred(cls, cuts: Sequence[U8], window: Window, sd_px: float) -> View:
+        """sd_px: standard deviation of the blur in px of the cut pictures."""
+        grey = np.empty((len(cuts), *cuts[0].shape), np.float32)
+        for picture, cut in zip(grey, cuts):
+            cv2.GaussianBlur(cut.astype(np.float32), (0, 0), sd_px, dst=picture)
+        return cls(grey, window)
+
+    def select(self, rows: Rows) -> View:
+        """Some of the pictures."""
+        return View(self.grey[rows], replace(self.window, origin=self.window.origin[rows]))
+
+    def read(self, pixels: F64) -> tuple[F32, F32]:
+        """Grey levels [n, P] at pixels [n, P, 2] of the whole picture, and their slopes [n, P, 2] per px of it."""
+        scale = self.window.scale
+        at = ((pixels - self.window.origin[:, None] + 0.5) * scale - 0.5).astype(np.float32)
+        value, slope = np.empty(at.shape[:2], np.float32), np.empty(at.shape, np.float32)
+        for picture, place, level, change in zip(self.grey, at, value, slope):
+            _bilinear(picture, place, level, change)
+        return value, slope * np.float32(scale)
+
+
+@njit(cache=True)
+def _bilinear(picture, pixels, value, slope):  # type: ignore[no-untyped-def]
+    """Outside of the picture the value is that of its border, the slope zero."""
+    height, width = picture.shape
+    half = np.float32(0.5)
+    for p in range(len(pixels)):
+        x, y = pixels[p, 0], pixels[p, 1]
+        inside = 0 <= x < width - 1 and 0 <= y < height - 1
+        i = min(max(int(np.floor(x)), 0), width - 2) if x == x else 0
+        j = min(max(int(np.floor(y)), 0), height - 2) if y == y else 0
+        u = min(max(x - np.float32(i), half * 0), half + half)
+        v = min(max(y - np.float32(j), half * 0), half + half)
+        a, b, c, d = picture[j, i], picture[j, i + 1], picture[j + 1, i], picture[j + 1, i + 1]
+        top, bottom = a + (b - a) * u, c + (d - c) * u
+        value[p] = top + (bottom - top) * v
+        slope[p, 0] = (b - a) + ((d - c) - (b - a)) * v if inside else half * 0
+        slope[p, 1] = bottom - top if inside else half * 0
