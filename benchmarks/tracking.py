@@ -46,6 +46,7 @@ from tracker.fit import fit_track
 from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.landmarker import track_landmarks
+from tracker.refine import refine_track
 from tracker.track import Bundle, Camera, Landmarks, Track
 
 PERSONS, PERSON_FRAMES = 3, 500
@@ -90,10 +91,15 @@ class Clip:
 
 def stages(clip: Clip, head: HeadModel) -> Iterator[tuple[str, Track, float]]:
     """The track after each stage, its name, and the processor time spent on the whole way there, ms a frame."""
-    count = len(clip.usable)
+    landmarks, camera, count = clip.landmarks, clip.camera, len(clip.usable)
     start = time.process_time()
-    track = fit_track(clip.landmarks, clip.camera, clip.bundle, head, clip.usable, clip.segment)
-    yield "landmarks", track, clip.spent + 1e3 * (time.process_time() - start) / count
+    track = fit_track(landmarks, camera, clip.bundle, head, clip.usable, clip.segment)
+    spent = clip.spent + 1e3 * (time.process_time() - start) / count
+    yield "landmarks", track, spent
+    if (video := clip.video) is not None:
+        start = time.process_time()
+        refined = refine_track(track, landmarks, camera, head, clip.segment, lambda: read_frames(video))
+        yield "refined", refined.track, spent + 1e3 * (time.process_time() - start) / count
 
 
 def watched(video: Path, head: HeadModel) -> Clip:
