@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.ground_truth import GroundTruth, rotation_error
+from benchmarks.ground_truth import GroundTruth
+from benchmarks.track_errors import rotation_error
 from personalize.ingest import find_usable
 from personalize.media import probe, read_frames
 from tracker.camera import estimate_camera

@@ -1,133 +1,146 @@
-"""Speed and accuracy of the landmark fit: `python -m benchmarks.tracking [VIDEO ...]`.
+"""Error of the tracker where the truth is known: `python -m benchmarks tracking [NAME | VIDEO ...]`.
 
-Three tables: motion of the embedded head itself under noise (truth known, and inside the model), rendered
-heads that the model does not contain (shared data, when it is there), and the videos named, where only
-consistency can be told.
+person    the embedded head itself as noisy landmarks, true focal: lower bounds, since truth and fit share the head
+inside    a film of the embedded head
+own       films of heads that the model cannot imitate (benchmarks/rendered_heads.py), made once and kept
+shared    rendered scan heads of the shared data ($PERSONALIZE_SHARED), where it is at hand
+
+Films go through the pipeline's own stages: usable frames, landmarks, camera, fit. NAMEs (`hand`, `person1`) choose
+clips; for a VIDEO only consistency can be told. At the end: the numbers wanted, and whether they are reached.
+
+surf, mean      distance of the neutral face from the true surface after one similarity; of the mean head's, mm
+face, rigid     face vertices, neutral and motion, after one similarity a clip and after one rigid transform, mm
+lips, plane, depth      lip vertices about their mean over time: in all, in the face's plane, in depth, mm
+neutr           lip vertices against the neutral, mm
+r, rmse, about  lip opening: correlation, RMSE, RMSE about its mean, mm
+rot, focal      head rotation without the constant, degrees; focal length, %
+jitter, still   second difference of the lips' error; face vertices' rms on a clip where nothing moves, mm
+close           share of the closures of the lips that are reached within one frame
+auc             how often a covered frame has less confidence than a clear one
+back            frames until the fit recovers from a hand or a fast turn
+ms              processor time of landmarks, camera and all stages up to here, a frame
 """
 
 from __future__ import annotations
 
+import argparse
 import os
-import sys
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
-from benchmarks.ground_truth import GroundTruth, compare
-from personalize.media import read_frames
-from tracker.energy import rotation_matrix
+from benchmarks.films import film
+from benchmarks.ground_truth import GroundTruth
+from benchmarks.in_model import noisy_landmarks
+from benchmarks.rendered_heads import SCENES
+from benchmarks.track_bars import Row, print_bars
+from benchmarks.track_errors import compare
+from personalize.ingest import find_usable
+from personalize.media import probe, read_frames
+from tracker.camera import estimate_camera
 from tracker.fit import fit_track
 from tracker.head import HeadModel, load_head
-from tracker.landmark_indices import BLENDSHAPE_NAMES, LEFT_EYE_OUTER, POINTS, RIGHT_EYE_OUTER
+from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.landmarker import track_landmarks
-from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
+from tracker.refine import refine_track
+from tracker.track import Bundle, Camera, Landmarks, Track
 
-FPS, SIZE, FOCAL, DISTANCE_M = 25.0, (1280, 720), 1500.0, 0.65
-SPEECH = (  # shapes, largest weight, Hz
-    (("jawOpen",), 0.35, 4.0),
-    (("mouthFunnel",), 0.4, 3.0),
-    (("mouthPucker",), 0.4, 2.5),
-    (("mouthSmileLeft", "mouthSmileRight"), 0.3, 0.5),
-    (("mouthLowerDownLeft", "mouthLowerDownRight"), 0.3, 4.5),
-    (("mouthUpperUpLeft", "mouthUpperUpRight"), 0.2, 4.0),
-    (("browInnerUp",), 0.5, 0.4),
-    (("eyeBlinkLeft", "eyeBlinkRight"), 0.8, 0.3),
-)
-CUT = 40.0  # mean grey levels by which the picture changes at a cut
+PERSONS, PERSON_FRAMES = 3, 500
+COLUMNS = {
+    "surf": "surface_mm",
+    "mean": "mean_surface_mm",
+    "face": "face_scaled_mm",
+    "rigid": "face_rigid_mm",
+    "lips": "lip_motion_mm",
+    "plane": "lip_in_plane_mm",
+    "depth": "lip_depth_mm",
+    "neutr": "lip_neutral_mm",
+    "r": "opening_r",
+    "rmse": "opening_rmse_mm",
+    "about": "opening_centred_mm",
+    "rot": "rotation_deg",
+    "focal": "focal_pct",
+    "jitter": "jitter_mm",
+    "still": "still_mm",
+    "close": "closures",
+    "auc": "confidence_auc",
+    "back": "recovery_frames",
+    "ms": "ms",
+}
+DECIMALS = {"r": 3, "jitter": 3, "still": 3, "focal": 1, "back": 0, "ms": 0}
 EMPTY = np.zeros((0, 3), np.float32)
 NO_BUNDLE = Bundle(np.zeros(0, np.int32), EMPTY, EMPTY, EMPTY, np.zeros((0, 4), np.float32))
 
 
-def camera(size: tuple[int, int], focal: float) -> Camera:
-    """A camera without distortion whose focal length is given."""
-    return Camera(focal, 0.0, ((size[0] - 1) / 2, (size[1] - 1) / 2), (), size, "given", "")
+@dataclass(frozen=True)
+class Clip:
+    """What the fit works on. video: None without pictures. spent: processor time up to here, ms a frame."""
+
+    landmarks: Landmarks
+    camera: Camera
+    bundle: Bundle
+    usable: NDArray[np.bool_]
+    segment: NDArray[np.int32]
+    video: Path | None
+    spent: float
 
 
-def fitted(
-    landmarks: Landmarks, focal: float, head: HeadModel, segment: NDArray[np.int32]
-) -> tuple[Track, float]:
-    """The track and the time it took, ms a frame."""
-    start = time.perf_counter()
-    usable = landmarks.presence > 0
-    track = fit_track(landmarks, camera(landmarks.size, focal), NO_BUNDLE, head, usable, segment)
-    return track, 1e3 * (time.perf_counter() - start) / len(usable)
+def stages(clip: Clip, head: HeadModel) -> Iterator[tuple[str, Track, float]]:
+    """The track after each stage, its name, and the processor time spent on the whole way there, ms a frame."""
+    landmarks, camera, count = clip.landmarks, clip.camera, len(clip.usable)
+    start = time.process_time()
+    track = fit_track(landmarks, camera, clip.bundle, head, clip.usable, clip.segment)
+    spent = clip.spent + 1e3 * (time.process_time() - start) / count
+    yield "landmarks", track, spent
+    if (video := clip.video) is not None:
+        start = time.process_time()
+        refined = refine_track(track, landmarks, camera, head, clip.segment, lambda: read_frames(video))
+        yield "refined", refined.track, spent + 1e3 * (time.process_time() - start) / count
 
 
-def talking_head(head: HeadModel, frames: int, seed: int) -> tuple[GroundTruth, Landmarks]:
-    """A random person of the head model who talks and turns the head, and noisy landmarks of it at 720p."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(frames) / FPS
-    identity = 0.6 * rng.normal(size=len(head.identity_basis)).astype(np.float32)
-    expression = _speech(head, t, rng)
-    matrix = rotation_matrix(
-        np.radians([8.0, 18.0, 4.0]) * np.sin(np.outer(t, [0.9, 0.7, 0.5]) + rng.uniform(0, 6, 3))
+def watched(video: Path, head: HeadModel) -> Clip:
+    """Landmarks and camera of a film, as the pipeline finds them; `spent` leaves out the search for usable frames."""
+    frames, _ = find_usable(probe(video))
+    cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
+    start = time.process_time()
+    landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box)
+    camera, bundle = estimate_camera(
+        landmarks, lambda: read_frames(video), head, usable=frames.usable, segments=frames.segment
     )
-    shift = np.array([0.0, 0.0, DISTANCE_M]) + 0.01 * np.sin(np.outer(t, [0.8, 0.5, 0.6]))
-    translation = shift - matrix @ head.template.mean(0)
-    many = np.broadcast_to(identity, (frames, len(identity)))
-    seen = head.landmark_positions(many, expression) @ matrix.transpose(0, 2, 1) + translation[:, None]
-    pixels = FOCAL * seen[..., :2] / seen[..., 2:] + (np.array(SIZE) - 1) / 2
-    eyes = 0.09 * FOCAL / DISTANCE_M
-    jitter = gaussian_filter1d(rng.normal(size=pixels.shape), 1.0, axis=0)
-    pixels += eyes * (0.0035 * jitter / jitter.std() + 0.006 * rng.normal(size=pixels.shape[1:]))
-    points = np.zeros((frames, POINTS, 3), np.float32)
-    points[:, head.landmark_embedding.landmarks] = np.dstack([pixels, seen[..., 2] * FOCAL / DISTANCE_M])
-    face = np.sort(head.regions["face"])
-    neutral = head.vertices(identity, np.zeros_like(expression[0]))[face]
-    truth = GroundTruth(
-        neutral=neutral.astype(np.float64),
-        faces=np.searchsorted(face, head.faces[np.isin(head.faces, face).all(1)]).astype(np.int32),
-        displacement=np.tensordot(expression, head.expression_basis[:, face], axes=1),
-        rotation=matrix,
-        translation=translation,
-        focal=FOCAL,
-        lip_gap_mm=np.asarray(head.lip_gap_mm(head.vertices(many, expression)), np.float64),
-    )
-    scores = np.zeros((frames, len(BLENDSHAPE_NAMES)), np.float32)
-    return truth, Landmarks(t, points, np.ones(frames, np.float32), scores, BLENDSHAPE_NAMES, SIZE)
+    spent = 1e3 * (time.process_time() - start) / len(frames.time)
+    return Clip(landmarks, camera, bundle, frames.usable, frames.segment, video, spent)
 
 
-def _speech(head: HeadModel, t: F64, rng: np.random.Generator) -> F32:
-    """[T, Ke] weights that move at the rates of speech."""
-    names = list(head.expression_names)
-    weights = np.zeros((len(t), len(names)), np.float32)
-    for shapes, size, rate in SPEECH:
-        wave = np.sin(2 * np.pi * (rate * t + rng.uniform()) + np.sin(1.7 * rate * t))
-        for name in shapes:
-            weights[:, names.index(name)] = np.clip(size * wave, 0, 1)
-    return weights
+def only_landmarks(landmarks: Landmarks, focal: float) -> Clip:
+    """Landmarks under a known camera."""
+    count, size = len(landmarks.time), landmarks.size
+    camera = Camera(focal, 0.0, ((size[0] - 1) / 2, (size[1] - 1) / 2), (), size, "given", "")
+    return Clip(landmarks, camera, NO_BUNDLE, np.ones(count, bool), np.zeros(count, np.int32), None, 0.0)
 
 
-def in_model(head: HeadModel) -> None:
-    """Truth inside the model: a lower bound of the error, since truth and fit share the head."""
-    print("\nembedded head, 720p, noise .35 % and static bias .6 % of the outer-eye distance, true focal")
-    for seed in range(3):
-        truth, landmarks = talking_head(head, 500, seed)
-        track, spent = fitted(landmarks, truth.focal, head, np.zeros(500, np.int32))
-        show(f"person {seed}", compare(track, head, truth) | {"ms_per_frame": spent})
+def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str, Clip, GroundTruth]]:
+    """(group, name, clip, truth) of every clip, or of the chosen ones."""
+    for seed in range(PERSONS):
+        if wanted(f"person{seed}", chosen):
+            truth, landmarks = noisy_landmarks(head, PERSON_FRAMES, seed)
+            yield "person", f"person{seed}", only_landmarks(landmarks, truth.focal), truth
+    for scene in SCENES:
+        if wanted(scene.name, chosen):
+            video, truth = film(scene, head)
+            yield ("own" if scene.bend_mm else "inside"), scene.name, watched(video, head), truth
+    shared = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[2] / "shared"))
+    for path in sorted((shared / "data/gt").glob("*.npz")):
+        if wanted(path.stem, chosen):
+            yield "shared", path.stem, watched(path.with_suffix(".mp4"), head), GroundTruth.load(path)
 
 
-def rendered(head: HeadModel, folder: Path) -> None:
-    """Rendered scan-based heads, which the model does not contain."""
-    print("\nrendered heads outside the model (shared data), focal 1.2 times the long side and the true one")
-    for path in sorted(folder.glob("*.npz")):
-        truth = GroundTruth.load(path)
-        landmarks, segment = detected(path.with_suffix(".mp4"))
-        for name, focal in (("1.2", 1.2 * max(landmarks.size)), ("true", truth.focal)):
-            track, spent = fitted(landmarks, focal, head, segment)
-            show(f"{path.stem} f={name}", compare(track, head, truth) | {"ms_per_frame": spent})
-
-
-def real(head: HeadModel, videos: list[Path], seconds: float) -> None:
-    """Real clips: consistency alone."""
-    print(f"\nreal clips, first {seconds:.0f} s, focal 1.2 times the long side")
-    for path in videos:
-        landmarks, segment = detected(path, seconds)
-        track, spent = fitted(landmarks, 1.2 * max(landmarks.size), head, segment)
-        show(path.stem, consistency(track, landmarks) | {"ms_per_frame": spent})
+def wanted(name: str, chosen: set[str]) -> bool:
+    """Whether a clip was chosen; without a choice all are."""
+    return not chosen or name in chosen
 
 
 def consistency(track: Track, landmarks: Landmarks) -> dict[str, float]:
@@ -146,34 +159,33 @@ def consistency(track: Track, landmarks: Landmarks) -> dict[str, float]:
     }
 
 
-def detected(path: Path, seconds: float = 60.0) -> tuple[Landmarks, NDArray[np.int32]]:
-    """Landmarks of the first seconds of a video, and the number of each frame's shot."""
-    frames: list[tuple[float, NDArray[np.uint8]]] = []
-    cuts: set[int] = set()
-    shot = [0]
-    for now, rgb in read_frames(path, max_side=1280):
-        if now > seconds:
-            break
-        if frames and np.abs(rgb[::8, ::8].astype(int) - frames[-1][1][::8, ::8]).mean() > CUT:
-            cuts.add(len(frames))
-        frames.append((now, rgb))
-        shot.append(len(cuts))
-    return track_landmarks(frames, len(frames), cuts), np.array(shot[1:], np.int32)
-
-
-def show(name: str, figures: dict[str, float]) -> None:
-    """One line of a table."""
-    print(f"{name:28s}", *(f"{key} {value:.3f}" for key, value in figures.items()), flush=True)
+def cell(column: str, value: float) -> str:
+    """A figure, or a dot where there is none."""
+    text = f"{value:.{DECIMALS.get(column, 2)}f}" if np.isfinite(value) else "."
+    return f"{text:>{max(6, len(column) + 1)}}"
 
 
 def main() -> None:
-    """Print the tables."""
-    head = load_head()
-    in_model(head)
-    shared = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[2] / "shared"))
-    if (shared / "data" / "gt").is_dir():
-        rendered(head, shared / "data" / "gt")
-    real(head, [Path(name) for name in sys.argv[1:]], seconds=20.0)
+    """Print the table, and the numbers wanted."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("clips", nargs="*", metavar="NAME | VIDEO")
+    named = parser.parse_args().clips
+    videos = [Path(name) for name in named if Path(name).suffix]
+    head, rows = load_head(), list[Row]()
+    print(f"{'clip':12s} {'stage':10s}", *(f"{name:>{max(6, len(name) + 1)}}" for name in COLUMNS), sep="")
+    if len(videos) < len(named) or not named:
+        for group, name, clip, truth in ground_truths(head, set(named)):
+            for stage, track, spent in stages(clip, head):
+                errors = compare(track, head, truth) | {"ms": spent}
+                rows.append(Row(group, name, stage, errors))
+                cells = (cell(column, errors.get(key, np.nan)) for column, key in COLUMNS.items())
+                print(f"{name:12s} {stage:10s}", *cells, sep="", flush=True)
+    for video in videos:
+        clip = watched(video, head)
+        for stage, track, spent in stages(clip, head):
+            figures = consistency(track, clip.landmarks) | {"ms": spent}
+            print(f"{video.stem} {stage}", *(f"{k} {v:.3f}" for k, v in figures.items()), flush=True)
+    print_bars(rows)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,253 @@
+"""Accuracy of a track against a head of known geometry.
+
+The neutrals are aligned once by a similarity (absolute size and the head frame's origin are conventions): by nearest
+points where the meshes differ, by their vertices where they are the same mesh. Motion is compared about its mean.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from kornia.geometry import axis_angle_to_rotation_matrix
+from numpy.typing import NDArray
+from scipy.ndimage import binary_closing
+from scipy.spatial import cKDTree
+from scipy.stats import rankdata
+from torch import from_numpy
+
+from benchmarks.ground_truth import GroundTruth
+from tracker.head import HeadModel
+from tracker.raster import project, vertex_normals
+from tracker.track import F64, Track
+
+NORMAL_M = 0.01  # two points whose normals differ by a unit count as this far apart
+CLOSED_MM = 0.5
+COVERED = 0.2  # share of the lips from which a frame counts as covered
+FAST_DEG = 4.0  # head rotation a frame from which a turn counts as fast
+RECOVERED = 1.5  # times the median error
+STILL_M = 1e-5  # a head that moves by less stands still
+
+Bool = NDArray[np.bool_]
+Similarity = tuple[float, F64, F64]
+
+
+def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, float]:
+    """Errors by name: mm, degrees, frames, shares, or r for correlations; NaN where the clip cannot tell.
+
+    Frames in which something covers the lips count for confidence and recovery alone.
+    """
+    fitted = axis_angle_to_rotation_matrix(from_numpy(track.rotation.astype(np.float64))).numpy()
+    judged = track.valid & (truth.covered <= COVERED)
+    resting = np.zeros(len(head.expression_names), np.float32)
+    neutral = head.vertices(track.identity, resting).astype(np.float64)
+    mean = head.template.astype(np.float64)
+    surface, frame = surface_error(neutral, track, fitted, head, truth)
+    errors = {"surface_mm": surface, "mean_surface_mm": surface_error(mean, track, fitted, head, truth)[0]}
+    if truth.vertices is not None:
+        errors |= face_errors(neutral, track, fitted, judged, head, truth)
+        frame = similarity(neutral[truth.vertices], truth.neutral)
+    errors |= lip_errors(neutral, frame, track, judged, head, truth)
+    errors |= opening_errors(track.lip_gap_mm.astype(np.float64) * frame[0], truth.lip_gap_mm, judged)
+    return errors | {
+        "rotation_deg": rotation_error(fitted[judged], truth.rotation[judged]),
+        "focal_pct": 100 * (track.focal / truth.focal - 1),
+        "turn_deg": turn(truth.rotation),
+        "confidence_auc": separation(track.confidence, truth.covered > COVERED),
+        "unseen_pct": 100 * float(1 - track.valid.mean()),
+    }
+
+
+def surface_error(
+    neutral: F64, track: Track, fitted: F64, head: HeadModel, truth: GroundTruth
+) -> tuple[float, Similarity]:
+    """Mean distance of the face of a neutral [D, 3] m from the true surface, mm, after the similarity given with it."""
+    face = head.regions["face"]
+    scale, turned, shift = _align(neutral[face], track, fitted, truth)
+    distance, _ = cKDTree(truth.neutral).query(scale * neutral[face] @ turned.T + shift)
+    near = distance < np.quantile(distance, 0.95)  # the two heads do not end at the same rim
+    return 1e3 * float(distance[near].mean()), (scale, turned, shift)
+
+
+def face_errors(
+    neutral: F64, track: Track, fitted: F64, judged: Bool, head: HeadModel, truth: GroundTruth
+) -> dict[str, float]:
+    """Errors of the face's vertices, for the same mesh.
+
+    face_rigid_mm, face_scaled_mm: neutral and motion in the head frame, after one rigid transform and one similarity a
+    clip. still_mm: rms of what moves in the head frame on a clip where nothing does, still_posed_mm: in the camera
+    frame. recovery_frames: after what disturbed the view, until the face in the picture is back within RECOVERED times
+    the clip's median.
+    """
+    face, seen = truth.vertices, np.flatnonzero(judged)
+    moves = head.expression_basis[:, face].astype(np.float64)
+    found = neutral[face] + np.tensordot(track.expression, moves, axes=1)
+    true = truth.neutral + truth.displacement
+    few = seen[:: max(1, len(seen) // 25)]
+    alignments = {
+        name: similarity(found[few].reshape(-1, 3), true[few].reshape(-1, 3), scaled)
+        for name, scaled in (("face_rigid_mm", False), ("face_scaled_mm", True))
+    }
+    errors = {
+        name: 1e3 * float(np.linalg.norm(scale * found[seen] @ turned.T + shift - true[seen], axis=-1).mean())
+        for name, (scale, turned, shift) in alignments.items()
+    }
+    posed = found @ fitted.transpose(0, 2, 1) + track.translation[:, None]
+    true_posed = true @ truth.rotation.transpose(0, 2, 1) + truth.translation[:, None]
+    offset = project(posed, track.focal, (0, 0)) - project(true_posed, truth.focal, (0, 0))
+    in_picture = np.linalg.norm(offset - np.median(offset[seen], axis=0), axis=-1).mean(1)
+    in_picture[~track.valid] = np.inf
+    errors["recovery_frames"] = recovery_frames(in_picture, disturbed(truth))
+    still = float(np.ptp(true_posed, axis=0).max()) < STILL_M
+    rms = {"still_mm": _rms_about_mean(found[seen]), "still_posed_mm": _rms_about_mean(posed[seen])}
+    return errors | {name: 1e3 * value if still else np.nan for name, value in rms.items()}
+
+
+def lip_errors(
+    neutral: F64, frame: Similarity, track: Track, judged: Bool, head: HeadModel, truth: GroundTruth
+) -> dict[str, float]:
+    """Errors of the lips' vertices: about the mean over time (in all, in the face's plane, in depth), and against the
+    neutral; `jitter_mm` is the mean second difference of the error over frames that follow each other.
+    """
+    lips, seen = head.regions["lips"], np.flatnonzero(judged)
+    scale, turned, shift = frame
+    if truth.vertices is None:
+        partner = _partners(scale * neutral @ turned.T + shift, head.faces, truth)[lips]
+    else:
+        partner = np.searchsorted(truth.vertices, lips)
+    moves = head.expression_basis[:, lips].astype(np.float64)
+    moved = 1e3 * scale * np.tensordot(track.expression[seen], moves, axes=1) @ turned.T
+    true = 1e3 * truth.displacement[seen][:, partner]
+    difference = moved - true
+    error = difference - difference.mean(0)
+    bend = np.diff(difference, 2, axis=0)[seen[2:] - seen[:-2] == 2]
+    return {
+        "lip_motion_mm": _mean_norm(error),
+        "lip_in_plane_mm": _mean_norm(error[..., :2]),
+        "lip_depth_mm": float(np.abs(error[..., 2]).mean()),
+        "lip_neutral_mm": _mean_norm(difference),
+        "lip_motion_truth": _mean_norm(true - true.mean(0)),
+        "jitter_mm": _mean_norm(bend),
+    }
+
+
+def opening_errors(gap: F64, true: F64, judged: Bool) -> dict[str, float]:
+    """Lip opening [T] mm against the truth, over the judged frames [T]."""
+    error = (gap - true)[judged]
+    moves = float(true[judged].std()) > 0.1
+    closed = true[judged] < CLOSED_MM
+    return {
+        "opening_r": float(np.corrcoef(gap[judged], true[judged])[0, 1]) if moves else np.nan,
+        "opening_rmse_mm": float(np.sqrt(np.mean(error**2))),
+        "opening_centred_mm": float(error.std()),
+        "closed_mm": float(np.median(error[closed])) if closed.any() else np.nan,
+        "closures": closures_reached(gap, np.where(judged, true, np.nan)),
+    }
+
+
+def closures_reached(gap: F64, true: F64) -> float:
+    """Share of the moments at which the true lips [T] mm close that the fitted ones close within one frame of."""
+
+    def closing(curve: F64) -> NDArray[np.int64]:
+        return np.flatnonzero((curve[1:] < CLOSED_MM) & (curve[:-1] >= CLOSED_MM)) + 1
+
+    moments, found = closing(true), closing(gap)
+    if not len(moments):
+        return np.nan
+    return float((np.abs(moments[:, None] - found) <= 1).any(1).mean())
+
+
+def separation(confidence: NDArray[np.floating], covered: Bool) -> float:
+    """Area under the ROC curve: how often a covered frame has less confidence than a clear one."""
+    count, others = int(covered.sum()), int((~covered).sum())
+    if not count or not others:
+        return np.nan
+    ranks = rankdata(-confidence)[covered]
+    return float((ranks.sum() - count * (count + 1) / 2) / (count * others))
+
+
+def disturbed(truth: GroundTruth) -> Bool:
+    """[T] frames in which the lips are covered or the head turns fast."""
+    step = truth.rotation[1:] @ truth.rotation[:-1].transpose(0, 2, 1)
+    fast = np.concatenate([[False], _angle_deg(step) > FAST_DEG])
+    seen = fast | (truth.covered > COVERED)
+    return seen | binary_closing(seen, iterations=2)  # a turn's far end belongs to it
+
+
+def recovery_frames(error: F64, disturbed: Bool) -> float:
+    """The most frames that it takes after a disturbance [T] until the error [T] is below RECOVERED times its median.
+
+    0: the first undisturbed frame is good. NaN without a disturbance. A clip's end counts as recovery.
+    """
+    ends = np.flatnonzero(disturbed[:-1] & ~disturbed[1:]) + 1
+    if not len(ends):
+        return np.nan
+    good = np.append(error < RECOVERED * np.median(error[~disturbed]), True)
+    return float(max(np.argmax(good[end:]) for end in ends))
+
+
+def rotation_error(fitted: F64, true: F64) -> float:
+    """Mean angle in degrees between [T, 3, 3] rotations, their constant difference removed."""
+    difference = true.transpose(0, 2, 1) @ fitted
+    return float(_angle_deg(difference @ _mean_rotation(difference).T).mean())
+
+
+def turn(rotation: F64) -> float:
+    """The largest angle in degrees of rotations [T, 3, 3] from their mean."""
+    return float(_angle_deg(rotation @ _mean_rotation(rotation).T).max())
+
+
+def similarity(source: F64, target: F64, scaled: bool = True) -> Similarity:
+    """Least-squares (scale, rotation [3, 3], shift [3]) with target = scale * rotation source + shift."""
+    a, b = source - source.mean(0), target - target.mean(0)
+    u, size, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    turned = (u * sign) @ vt
+    scale = float((size * sign).sum() / (a**2).sum()) if scaled else 1.0
+    return scale, turned, target.mean(0) - scale * turned @ source.mean(0)
+
+
+def _align(source: F64, track: Track, fitted: F64, truth: GroundTruth) -> Similarity:
+    """Similarity from the fitted head frame to the true one, by nearest points of source [n, 3] m and the truth."""
+    first = int(np.flatnonzero(track.valid)[0])
+    scale = float(truth.translation[first, 2] / track.translation[first, 2] * track.focal / truth.focal)
+    turned = truth.rotation[first].T @ fitted[first]
+    # Not by the translations: with a wrong focal length they are centimetres apart.
+    shift = truth.neutral.mean(0) - scale * turned @ source.mean(0)
+    tree = cKDTree(truth.neutral)
+    for _ in range(40):
+        # Both ways: nearest points from one side alone let the scale collapse.
+        aligned = scale * source @ turned.T + shift
+        there, partner = tree.query(aligned)
+        back, origin = cKDTree(aligned).query(truth.neutral)
+        near, found = there < np.quantile(there, 0.8), back < np.quantile(back, 0.8)
+        scale, turned, shift = similarity(
+            np.concatenate([source[near], source[origin[found]]]),
+            np.concatenate([truth.neutral[partner[near]], truth.neutral[found]]),
+        )
+    return scale, turned, shift
+
+
+def _partners(aligned: F64, faces: NDArray[np.int32], truth: GroundTruth) -> NDArray[np.int64]:
+    """[D] the true vertex for each of the fitted head's, near and turned alike: closed lips touch each other."""
+
+    def features(vertices: F64, faces: NDArray[np.int32]) -> F64:
+        return np.concatenate([vertices, NORMAL_M * vertex_normals(vertices, faces)], axis=1)
+
+    return cKDTree(features(truth.neutral, truth.faces)).query(features(aligned, faces))[1]
+
+
+def _mean_rotation(rotations: F64) -> F64:
+    u, _, vt = np.linalg.svd(rotations.mean(0))
+    return u @ vt
+
+
+def _angle_deg(rotations: F64) -> F64:
+    cosine = (np.trace(rotations, axis1=-2, axis2=-1) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def _mean_norm(vectors: F64) -> float:
+    return float(np.linalg.norm(vectors, axis=-1).mean())
+
+
+def _rms_about_mean(places: F64) -> float:
+    return float(np.sqrt(((places - places.mean(0)) ** 2).sum(-1).mean()))

@@ -1,0 +1,67 @@
+"""The bench's films: the landmarker finds their faces where the truth has them, props cover what they should."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.films import film, shoot
+from benchmarks.ground_truth import GroundTruth
+from benchmarks.rendered_heads import Scene
+from personalize.media import read_frames
+from tracker.head import HeadModel, load_head
+from tracker.landmarker import track_landmarks
+from tracker.raster import project
+
+SCENE = Scene("tiny", 5, seconds=0.2, head=0.5)
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, GroundTruth]:
+    path = tmp_path_factory.mktemp("films") / "tiny.mp4"
+    return path, shoot(SCENE, load_head(), path)
+
+
+def test_landmarks_lie_on_the_true_face(shot: tuple[Path, GroundTruth]) -> None:
+    path, truth = shot
+    landmarks = track_landmarks(read_frames(path), 5, set())
+    assert (landmarks.presence > 0.9).all()
+    posed = (truth.neutral + truth.displacement) @ truth.rotation.transpose(0, 2, 1) + truth.translation[
+        :, None
+    ]
+    centre = [(side - 1) / 2 for side in SCENE.size]
+    assert truth.vertices is not None
+    upper = np.searchsorted(truth.vertices, load_head().regions["inner_lip_upper"])
+    corners = project(posed[:, upper[[0, -1]]], truth.focal, centre)
+    found = landmarks.points[:, [78, 308], :2]
+    width = np.linalg.norm(corners[:, 0] - corners[:, 1], axis=-1)
+    assert (np.linalg.norm(found - corners, axis=-1) < 0.15 * width[:, None]).all()
+
+
+def test_same_scene_same_film(shot: tuple[Path, GroundTruth], tmp_path: Path) -> None:
+    path, truth = shot
+    again = shoot(SCENE, load_head(), tmp_path / "again.mp4")
+    assert (tmp_path / "again.mp4").read_bytes() == path.read_bytes()
+    np.testing.assert_array_equal(again.displacement, truth.displacement)
+
+
+def test_hand_covers_the_mouth_for_half_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("benchmarks.props.HAND_S", (0.04, 0.04, 0.08))
+    truth = shoot(replace(SCENE, hand=True, seconds=0.32), load_head(), tmp_path / "hand.mp4")
+    np.testing.assert_array_equal(truth.covered > 0.5, [False, False, True, True, True, False, False, False])
+
+
+def test_a_film_is_made_once(shot: tuple[Path, GroundTruth], monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Path] = []
+
+    def shoot_once(scene: Scene, head: HeadModel, path: Path) -> GroundTruth:
+        made.append(path)
+        return shot[1]
+
+    monkeypatch.setattr("benchmarks.films.shoot", shoot_once)
+    (path, truth), (again, read) = film(SCENE, load_head()), film(SCENE, load_head())
+    film(replace(SCENE, noise=1.0), load_head())
+    assert again == path and made[0] == path and len(made) == 2
+    np.testing.assert_allclose(read.displacement, truth.displacement, atol=1e-5)
+    np.testing.assert_array_equal(read.vertices, truth.vertices)

@@ -1,0 +1,30 @@
+"""Tubes: closed, and turned outward, or the rasterizer would not draw them."""
+
+import numpy as np
+import pytest
+
+from benchmarks.props import glasses, hand, tube
+from tracker.head import load_head
+
+
+def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    return float(np.linalg.det(vertices[faces] - vertices.mean(0)).sum() / 6)
+
+
+def test_tube_has_the_volume_of_a_cylinder() -> None:
+    points = np.linspace([0, 0, 0], [0, 0.1, 0], 200)
+    radius = np.full(200, 0.01)
+    radius[[0, -1]] = 0
+    prism = 10 / 2 * np.sin(2 * np.pi / 10) * 0.01**2 * 0.1  # ten sides
+    assert volume(*tube(points, radius)) == pytest.approx(prism, rel=0.02)
+
+
+def test_glasses_and_hand_turn_outward_and_stand_before_the_face() -> None:
+    head = load_head()
+    for prop in (glasses(head), hand(head)):
+        assert volume(prop.vertices, prop.faces) > 0
+    eyes = head.template[head.regions["eyes"], 2].max()
+    assert 0.005 < glasses(head).vertices[:, 2].max() - eyes < 0.03
+    lips = head.template[head.regions["lips"], 2].max()
+    assert hand(head).at(3.1)[:, 2].min() > lips
+    assert hand(head).at(0.0)[:, 1].max() < head.template[:, 1].min() + 0.1

@@ -1,0 +1,68 @@
+"""Heads that the model cannot imitate: how far off they are, that their lips still meet, and how they move."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.rendered_heads import SCENES, Scene, scene_motion, stranger
+from tracker.head import HeadModel, load_head
+
+SCENE = Scene("any", 3, seconds=2.0)
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return load_head()
+
+
+def test_neutral_is_beyond_every_identity(head: HeadModel) -> None:
+    face = head.regions["face"]
+    person = stranger(head, SCENE).template[face].astype(np.float64)
+    centred = head.template[face].astype(np.float64)
+    rigid = [np.broadcast_to(axis, centred.shape) for axis in np.eye(3)]
+    rigid += [np.cross(axis, centred) for axis in np.eye(3)]
+    known = np.concatenate([head.identity_basis[:, face], np.stack([*rigid, centred])]).reshape(
+        -1, person.size
+    )
+    wanted = (person - head.template[face]).ravel()
+    left = wanted - np.linalg.lstsq(known.T, wanted, rcond=None)[0] @ known
+    assert 1e3 * np.sqrt((left.reshape(-1, 3) ** 2).sum(1).mean()) > 1.0
+
+
+def test_motion_is_beyond_the_expressions(head: HeadModel) -> None:
+    lips = head.regions["lips"]
+    weights = scene_motion(SCENE).expression_for(head.expression_names).astype(np.float64)
+    moved = np.tensordot(weights, stranger(head, SCENE).expression_basis[:, lips], axes=1).reshape(
+        len(weights), -1
+    )
+    known = head.expression_basis[:, lips].reshape(len(head.expression_names), -1).astype(np.float64)
+    left = moved - np.linalg.lstsq(known.T, moved.T, rcond=None)[0].T @ known
+    # Even with weights of either sign and size.
+    assert 1e3 * np.linalg.norm(left.reshape(len(weights), -1, 3), axis=-1).mean() > 0.05
+
+
+def test_without_bend_and_warp_the_person_is_the_head(head: HeadModel) -> None:
+    person = stranger(head, replace(SCENE, bend_mm=0.0, warp=0.0))
+    np.testing.assert_allclose(person.expression_basis, head.expression_basis, atol=1e-7)
+    wanted = (person.template - head.template).reshape(-1).astype(np.float64)
+    known = head.identity_basis.reshape(len(head.identity_basis), -1).astype(np.float64)
+    assert np.abs(wanted - np.linalg.lstsq(known.T, wanted, rcond=None)[0] @ known).max() < 1e-6
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
+def test_lips_meet_and_part(head: HeadModel, scene: Scene) -> None:
+    person = stranger(head, scene)
+    weights = scene_motion(scene).expression_for(head.expression_names)
+    gap = person.lip_gap_mm(person.vertices(np.zeros(1), weights))
+    assert -0.5 < gap.min() < 0.3
+    assert gap.max() > 5 if scene.speaks else np.ptp(gap) == 0
+
+
+def test_fast_turn_is_fast_and_comes_back() -> None:
+    turned = scene_motion(replace(SCENE, seconds=5.0, head=0.0, fast_turn_deg=30.0))
+    turns = Rotation.from_rotvec(turned.rotation)
+    angle = np.degrees((turns * turns[0].inv()).magnitude())
+    assert angle.max() == pytest.approx(30, abs=0.1) and angle[-1] < 0.1
+    assert np.abs(np.diff(angle)).max() > 5

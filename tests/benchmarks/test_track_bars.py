@@ -1,0 +1,49 @@
+"""The limits: means and worst values over clips, the last stage's row, gains, and clips that get worse."""
+
+import numpy as np
+
+from benchmarks.track_bars import Bar, Row, last_stages, print_bars
+
+
+def rows() -> list[Row]:
+    def errors(about: float, rotation: float, focal: float, turned: float) -> dict[str, float]:
+        return {
+            "opening_centred_mm": about,
+            "rotation_deg": rotation,
+            "jitter_mm": about,
+            "focal_pct": focal,
+            "turn_deg": turned,
+            "surface_mm": 1.0,
+            "mean_surface_mm": 2.0,
+        }
+
+    return [
+        Row("own", "a", "landmarks", errors(1.0, 1.0, -5, 20)),
+        Row("own", "a", "refined", errors(0.5, 1.1, -5, 20)),
+        Row("shared", "b", "landmarks", errors(1.0, 1.0, 40, 5)),
+        Row("shared", "b", "refined", errors(0.7, 0.1, 40, 5)),
+        Row("person", "c", "landmarks", errors(0.1, 0.1, 0, 20)),
+    ]
+
+
+def test_bars_look_at_the_last_stage_of_their_groups() -> None:
+    last = last_stages(rows())
+    assert [(row.clip, row.stage) for row in last] == [("a", "refined"), ("b", "refined"), ("c", "landmarks")]
+    bar = Bar("about", ("own", "shared"), "opening_centred_mm", 0.6)
+    assert bar.reached(last) == 0.6 and bar.holds(0.6) and not bar.holds(0.61)
+    assert Bar("about", ("own",), "opening_centred_mm", 0.6, worst=True).reached(last) == 0.5
+    assert np.isnan(Bar("none", ("own",), "still_mm", 0.1).reached(last))
+
+
+def test_focal_counts_only_where_the_head_turns() -> None:
+    assert Bar("focal", ("own", "shared"), "turning_focal_pct", 10, worst=True).reached(rows()) == 5
+
+
+def test_printed_answers() -> None:
+    lines: list[str] = []
+    print_bars(rows(), lines.append)
+    answer = {line.split(",")[0].split(" lowered")[0]: line for line in lines if line.strip()}
+    assert answer["out of model: surface against the mean head's"].endswith("yes")
+    assert answer["opening_centred_mm"].endswith("yes") and " 40.0 " in answer["opening_centred_mm"]
+    assert answer["rotation_deg"].endswith("no; raised on a")
+    assert not any("still face" in line for line in lines)

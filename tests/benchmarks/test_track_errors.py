@@ -1,0 +1,193 @@
+"""Errors of a track, on cases worked by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.ground_truth import GroundTruth
+from benchmarks.track_errors import (
+    closures_reached,
+    compare,
+    disturbed,
+    opening_errors,
+    recovery_frames,
+    separation,
+    similarity,
+)
+from tracker.head import HeadModel, load_head
+from tracker.track import Track
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return load_head()
+
+
+@pytest.fixture(scope="module")
+def exact(head: HeadModel) -> tuple[Track, GroundTruth]:
+    """A track and the truth that it reproduces exactly, but for a size of 1.1."""
+    random = np.random.default_rng(0)
+    identity = 0.5 * random.standard_normal(len(head.identity_basis)).astype(np.float32)
+    expression = 0.2 * random.random((FRAMES, len(head.expression_names))).astype(np.float32)
+    rotation = Rotation.from_euler("xyz", [180, 0, 0], degrees=True) * Rotation.from_euler(
+        "y", 5 * random.standard_normal((FRAMES, 1)), degrees=True
+    )
+    translation = np.array([0, 0, 0.5]) + 0.01 * random.standard_normal((FRAMES, 3))
+    face = np.sort(head.regions["face"])
+    gap = head.lip_gap_mm(head.vertices(identity, expression))
+    truth = GroundTruth(
+        neutral=1.1 * head.vertices(identity, np.zeros(len(head.expression_names)))[face].astype(np.float64),
+        faces=np.searchsorted(face, head.faces[np.isin(head.faces, face).all(1)]).astype(np.int32),
+        displacement=1.1
+        * np.tensordot(expression.astype(np.float64), head.expression_basis[:, face], axes=1),
+        rotation=rotation.as_matrix(),
+        translation=1.1 * translation,
+        focal=900.0,
+        lip_gap_mm=1.1 * gap.astype(np.float64),
+        covered=np.zeros(FRAMES),
+        vertices=face.astype(np.int32),
+    )
+    track = Track(
+        time=np.arange(FRAMES) / 25,
+        valid=np.ones(FRAMES, bool),
+        confidence=np.ones(FRAMES, np.float32),
+        identity=identity,
+        expression=expression,
+        jaw=np.zeros((FRAMES, 3), np.float32),
+        neck=np.zeros((FRAMES, 3), np.float32),
+        eyes=np.zeros((FRAMES, 2, 3), np.float32),
+        rotation=rotation.as_rotvec().astype(np.float32),
+        translation=translation.astype(np.float32),
+        focal=900.0,
+        principal=np.zeros(2, np.float32),
+        distortion=np.zeros(0, np.float32),
+        size=(640, 640),
+        head=head.name,
+        lip_gap_mm=gap.astype(np.float32),
+        reprojection_px=np.zeros(FRAMES, np.float32),
+    )
+    return track, truth
+
+
+@pytest.mark.parametrize("same_mesh", [True, False])
+def test_an_exact_track_has_no_error(
+    exact: tuple[Track, GroundTruth], head: HeadModel, same_mesh: bool
+) -> None:
+    track, truth = exact
+    errors = compare(track, head, truth if same_mesh else replace(truth, vertices=None))
+    for name in ("surface_mm", "lip_motion_mm", "lip_neutral_mm", "opening_rmse_mm", "jitter_mm"):
+        assert errors[name] == pytest.approx(0, abs=0.03), name
+    assert errors["opening_r"] == pytest.approx(1) and errors["focal_pct"] == 0
+    assert errors["rotation_deg"] == pytest.approx(0, abs=0.01)
+    assert errors["mean_surface_mm"] > 0.3
+    if same_mesh:
+        assert errors["face_scaled_mm"] == pytest.approx(0, abs=0.01)
+        # A tenth of the distance of the face's points from their middle, some 60 mm.
+        assert 3 < errors["face_rigid_mm"] < 8
+
+
+def test_a_lip_offset_counts_against_the_neutral_only(
+    exact: tuple[Track, GroundTruth], head: HeadModel
+) -> None:
+    track, truth = exact
+    lower = truth.displacement.copy()
+    assert truth.vertices is not None
+    lower[:, np.isin(truth.vertices, head.regions["lips"])] += [0, 0, 0.002]
+    errors = compare(track, head, replace(truth, displacement=lower))
+    assert errors["lip_motion_mm"] == pytest.approx(0, abs=0.01)
+    assert errors["lip_neutral_mm"] == pytest.approx(2, abs=0.02)
+
+
+def test_motion_errors_are_split_into_plane_and_depth(
+    exact: tuple[Track, GroundTruth], head: HeadModel
+) -> None:
+    track, truth = exact
+    shaken = (
+        truth.displacement
+        + np.array([0.0003, 0, 0.0004]) * np.where(np.arange(FRAMES) % 2, 1, -1)[:, None, None]
+    )
+    errors = compare(track, head, replace(truth, displacement=shaken))
+    assert errors["lip_motion_mm"] == pytest.approx(0.5, abs=0.01)
+    assert errors["lip_in_plane_mm"] == pytest.approx(0.3, abs=0.01)
+    assert errors["lip_depth_mm"] == pytest.approx(0.4, abs=0.01)
+    assert errors["jitter_mm"] == pytest.approx(2.0, abs=0.02)  # 4 x the amplitude
+
+
+def test_still_clip_measures_jitter(exact: tuple[Track, GroundTruth], head: HeadModel) -> None:
+    track, truth = exact
+    still = replace(
+        truth,
+        displacement=np.broadcast_to(truth.displacement[:1], truth.displacement.shape),
+        rotation=np.broadcast_to(truth.rotation[:1], truth.rotation.shape),
+        translation=np.broadcast_to(truth.translation[:1], truth.translation.shape),
+    )
+    assert np.isnan(compare(track, head, truth)["still_mm"])
+    same = replace(track, expression=np.broadcast_to(track.expression[:1], track.expression.shape))
+    errors = compare(same, head, still)
+    assert errors["still_mm"] == pytest.approx(0, abs=1e-3)
+    assert errors["still_posed_mm"] > 3  # the pose of the track still moves
+
+
+def test_opening_errors() -> None:
+    true = np.array([0.0, 2, 4, 6])
+    errors = opening_errors(true + np.array([1, 1, 1, 2]), true, np.array([True, True, True, False]))
+    assert errors["opening_r"] == pytest.approx(1)
+    assert errors["opening_rmse_mm"] == pytest.approx(1) and errors["opening_centred_mm"] == pytest.approx(0)
+    assert errors["closed_mm"] == 1
+
+
+def test_closures_within_one_frame() -> None:
+    true = np.array([3, 0, 3, 3, 0, 0, 3, 3, 0, 3.0])
+    late = np.array([3, 3, 0, 3, 3, 3, 0, 3, 3, 3.0])  # one frame, two frames, never
+    assert closures_reached(true, true) == 1
+    assert closures_reached(late, true) == pytest.approx(1 / 3)
+    assert np.isnan(closures_reached(true, true + 5))
+
+
+def test_separation_is_the_area_under_the_curve() -> None:
+    covered = np.array([True, True, False, False])
+    assert separation(np.array([0.1, 0.2, 0.8, 0.9]), covered) == 1
+    assert separation(np.array([0.1, 0.85, 0.8, 0.9]), covered) == 0.75
+    assert separation(np.full(4, 0.5), covered) == 0.5
+    assert np.isnan(separation(np.ones(4), np.zeros(4, bool)))
+
+
+def test_recovery_counts_from_the_end_of_a_disturbance() -> None:
+    disturbed = np.zeros(12, bool)
+    disturbed[3:5] = disturbed[8:9] = True
+    error = np.array([1, 1, 1, 9, 9, 5, 4, 1, 9, 1, 1, 1.0])
+    assert recovery_frames(error, disturbed) == 2
+    assert np.isnan(recovery_frames(error, np.zeros(12, bool)))
+
+
+def test_similarity_is_found_exactly() -> None:
+    random = np.random.default_rng(1)
+    source, turned = random.normal(size=(9, 3)), Rotation.random(random_state=2).as_matrix()
+    scale, found, shift = similarity(source, 2 * source @ turned.T + [1, 2, 3])
+    assert scale == pytest.approx(2)
+    np.testing.assert_allclose(found, turned, atol=1e-9)
+    np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-9)
+    assert similarity(source, 2 * source, scaled=False)[0] == 1
+
+
+def test_covered_frames_do_not_count(exact: tuple[Track, GroundTruth], head: HeadModel) -> None:
+    track, truth = exact
+    covered = (np.arange(FRAMES) == 4).astype(float)
+    gap, moved = truth.lip_gap_mm.copy(), truth.displacement.copy()
+    gap[4] += 9
+    moved[4] += 0.01
+    errors = compare(track, head, replace(truth, covered=covered, lip_gap_mm=gap, displacement=moved))
+    for name in ("opening_rmse_mm", "lip_motion_mm", "jitter_mm", "face_scaled_mm"):
+        assert errors[name] == pytest.approx(0, abs=0.01), name
+
+
+def test_a_turn_there_and_back_is_one_disturbance(exact: tuple[Track, GroundTruth]) -> None:
+    _, truth = exact
+    angle = np.array([0, 0, 0, 8, 20, 30, 31, 30, 20, 8, 0, 0])[:, None]
+    turns = Rotation.from_euler("y", angle, degrees=True).as_matrix()
+    found = disturbed(replace(truth, rotation=turns))
+    np.testing.assert_array_equal(np.flatnonzero(found), np.arange(3, 11))
