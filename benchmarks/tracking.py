@@ -42,10 +42,12 @@ from benchmarks.track_errors import compare
 from personalize.ingest import find_usable
 from personalize.media import probe, read_frames
 from tracker.camera import estimate_camera
+from tracker.confidence import bare, judge
 from tracker.fit import fit_track
 from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.landmarker import track_landmarks
+from tracker.occlusion import Appearance, FaceWatch
 from tracker.refine import refine_track
 from tracker.track import Bundle, Camera, Landmarks, Track
 
@@ -78,13 +80,14 @@ NO_BUNDLE = Bundle(np.zeros(0, np.int32), EMPTY, EMPTY, EMPTY, np.zeros((0, 4), 
 
 @dataclass(frozen=True)
 class Clip:
-    """What the fit works on. video: None without pictures. spent: processor time up to here, ms a frame."""
+    """What the fit works on. appearance, video: None without pictures. spent: processor time up to here, ms a frame."""
 
     landmarks: Landmarks
     camera: Camera
     bundle: Bundle
     usable: NDArray[np.bool_]
     segment: NDArray[np.int32]
+    appearance: Appearance | None
     video: Path | None
     spent: float
 
@@ -92,14 +95,23 @@ class Clip:
 def stages(clip: Clip, head: HeadModel) -> Iterator[tuple[str, Track, float]]:
     """The track after each stage, its name, and the processor time spent on the whole way there, ms a frame."""
     landmarks, camera, count = clip.landmarks, clip.camera, len(clip.usable)
+    evidence = None if clip.appearance is None else bare(clip.appearance)
     start = time.process_time()
-    track = fit_track(landmarks, camera, clip.bundle, head, clip.usable, clip.segment)
+    track = fit_track(landmarks, camera, clip.bundle, head, clip.usable, clip.segment, evidence=evidence)
     spent = clip.spent + 1e3 * (time.process_time() - start) / count
-    yield "landmarks", track, spent
+    yield "landmarks", judged(track, clip), spent
     if (video := clip.video) is not None:
         start = time.process_time()
-        refined = refine_track(track, landmarks, camera, head, clip.segment, lambda: read_frames(video))
-        yield "refined", refined.track, spent + 1e3 * (time.process_time() - start) / count
+        refined = refine_track(
+            *(track, landmarks, camera, head, clip.segment, lambda: read_frames(video)), evidence=evidence
+        )
+        spent += 1e3 * (time.process_time() - start) / count
+        yield "refined", judged(refined.track, clip), spent
+
+
+def judged(track: Track, clip: Clip) -> Track:
+    """The track with the confidence that the pictures leave it."""
+    return track if clip.appearance is None else judge(track, clip.appearance)[0]
 
 
 def watched(video: Path, head: HeadModel) -> Clip:
@@ -107,19 +119,22 @@ def watched(video: Path, head: HeadModel) -> Clip:
     frames, _ = find_usable(probe(video))
     cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
     start = time.process_time()
-    landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box)
+    watch = FaceWatch()
+    landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box, watch=watch)
+    appearance = watch.appearance()
     camera, bundle = estimate_camera(
         landmarks, lambda: read_frames(video), head, usable=frames.usable, segments=frames.segment
     )
     spent = 1e3 * (time.process_time() - start) / len(frames.time)
-    return Clip(landmarks, camera, bundle, frames.usable, frames.segment, video, spent)
+    return Clip(landmarks, camera, bundle, frames.usable, frames.segment, appearance, video, spent)
 
 
 def only_landmarks(landmarks: Landmarks, focal: float) -> Clip:
     """Landmarks under a known camera."""
     count, size = len(landmarks.time), landmarks.size
     camera = Camera(focal, 0.0, ((size[0] - 1) / 2, (size[1] - 1) / 2), (), size, "given", "")
-    return Clip(landmarks, camera, NO_BUNDLE, np.ones(count, bool), np.zeros(count, np.int32), None, 0.0)
+    everywhere, one_shot = np.ones(count, bool), np.zeros(count, np.int32)
+    return Clip(landmarks, camera, NO_BUNDLE, everywhere, one_shot, None, None, 0.0)
 
 
 def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str, Clip, GroundTruth]]:
