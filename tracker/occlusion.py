@@ -78,7 +78,10 @@ class FaceWatch:
         if len(seen):
             colour, place = np.stack(self._colour)[seen], np.stack(self._place)[seen]
             for region in regions(np.median(place, axis=0).astype(np.float64)):
-                strangeness[seen] = np.maximum(strangeness[seen], _strangeness(colour[:, region]))
+                width = np.ptp(place[:, region, 0].astype(np.float32), axis=1)
+                # A side that turns away is seen at a slant, and at its rim the background.
+                slant = np.minimum(width / np.median(width), 1.0) ** 2
+                strangeness[seen] = np.maximum(strangeness[seen], slant * _strangeness(colour[:, region]))
             sharpness[seen] = detail[seen] / max(float(np.median(detail[seen])), 1e-6)
         return Appearance(strangeness, sharpness)
 
