@@ -83,7 +83,7 @@ class LandmarkStage(Stage):
             watch=watch,
         )
         files.write_landmarks(folder / "landmarks.npz", landmarks)
-        files.write_appearance(folder / "appearance.npz", watch.appearance())
+        files.write_appearance(folder / "appearance.npz", watch.appearance(frames.usable))
 
 
 class CameraStage(Stage):

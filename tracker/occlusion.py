@@ -27,6 +27,7 @@ LEARNED = 400  # frames, spread over the clip, that the patterns are learned fro
 PATTERNS = 3  # components besides the mean: a turned head, other light, an open mouth
 FRAMES_PER_PATTERN = 20  # fewer would make each frame its own pattern
 TRUSTED = 0.6  # share of the frames that are taken to show the bare face
+LEAST_POINTS = 20  # of a region: in a clip of profiles the far side has fewer
 EYE_REACH = 0.27  # of the distance between the eyes: lids and gaze change within it and cover nothing
 
 
@@ -70,15 +71,18 @@ class FaceWatch:
         self._place.append(unit.astype(np.float16))
         self._detail.append(_detail(cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)))
 
-    def appearance(self) -> Appearance:
-        """Of the pictures seen so far; meant for when all have passed."""
+    def appearance(self, usable: NDArray[np.bool_]) -> Appearance:
+        """Of all pictures seen. usable: [T] bool, those that show the person; the others tell nothing."""
         total, detail = len(self._detail), np.array(self._detail, np.float32)
         strangeness, sharpness = np.zeros(total, np.float32), np.ones(total, np.float32)
-        seen = np.flatnonzero(np.isfinite(detail))
+        seen = np.flatnonzero(np.isfinite(detail) & usable)
         if len(seen):
             colour, place = np.stack(self._colour)[seen], np.stack(self._place)[seen]
             for region in regions(np.median(place, axis=0).astype(np.float64)):
-                strangeness[seen] = np.maximum(strangeness[seen], _strangeness(colour[:, region]))
+                width = np.ptp(place[:, region, 0].astype(np.float32), axis=1)
+                # A side that turns away is seen at a slant, and at its rim the background.
+                slant = np.minimum(width / np.median(width), 1.0) ** 2
+                strangeness[seen] = np.maximum(strangeness[seen], slant * _strangeness(colour[:, region]))
             sharpness[seen] = detail[seen] / max(float(np.median(detail[seen])), 1e-6)
         return Appearance(strangeness, sharpness)
 
@@ -91,7 +95,7 @@ def _detail(face: U8) -> float:
 
 
 def regions(place: NDArray[np.floating]) -> list[NDArray[np.intp]]:
-    """Landmarks of the mouth with the chin, and of both sides of the upper face, without the eyes and the rim.
+    """Landmarks of the mouth with the chin, and of each side of the upper face, without the eyes and the rim.
 
     place: [478, 2], a typical face, upright, in any unit.
     """
@@ -101,7 +105,8 @@ def regions(place: NDArray[np.floating]) -> list[NDArray[np.intp]]:
     skin[list(OVAL)] = False
     x, y = ((place - place[list(LIPS)].mean(0)) / eyes).T
     mouth = (np.abs(x) < 0.5) & (y > -0.25) & (y < 0.4)
-    return [np.flatnonzero(skin & part) for part in (mouth, ~mouth & (x < -0.05), ~mouth & (x > 0.05))]
+    parts = [np.flatnonzero(skin & part) for part in (mouth, ~mouth & (x < -0.05), ~mouth & (x > 0.05))]
+    return [part for part in parts if len(part) >= LEAST_POINTS]
 
 
 def _strangeness(colour: U8) -> F64:

@@ -67,11 +67,11 @@ def clip(covered=None, spoil=None) -> tuple[list, Landmarks]:
     return frames, Landmarks(time, points, presence, scores, BLENDSHAPE_NAMES, (SIDE, SIDE))
 
 
-def look(frames, landmarks):
+def look(frames, landmarks, usable=None):
     watch = FaceWatch()
     for (_, rgb), points in zip(frames, landmarks.points):
         watch.see(rgb, points)
-    return watch.appearance()
+    return watch.appearance(np.ones(len(frames), bool) if usable is None else usable)
 
 
 def test_a_bare_face_that_moves_in_changing_light_is_itself():
@@ -105,6 +105,16 @@ def test_frames_without_a_face_say_nothing():
     landmarks.points[:] = np.nan
     nothing = look(frames, landmarks)
     assert (nothing.strangeness == 0).all() and (nothing.sharpness == 1).all()
+
+
+def test_another_person_is_not_the_measure():
+    """In the second half somebody else is in the picture; those frames are not usable, and say nothing."""
+    other = cv2.GaussianBlur(texture(3), (0, 0), 1)
+    frames, landmarks = clip(spoil=lambda frame, own: cv2.add(own // 4, other) if frame >= 25 else own)
+    usable = np.arange(FRAMES) < 25
+    seen = look(frames, landmarks, usable)
+    assert seen.strangeness.max() < 0.08 and (seen.strangeness[25:] == 0).all()
+    assert look(frames, landmarks).strangeness.max() > 0.3
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
