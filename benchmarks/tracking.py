@@ -121,7 +121,7 @@ def watched(video: Path, head: HeadModel) -> Clip:
     start = time.process_time()
     watch = FaceWatch()
     landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box, watch=watch)
-    appearance = watch.appearance()
+    appearance = watch.appearance(frames.usable)
     camera, bundle = estimate_camera(
         landmarks, lambda: read_frames(video), head, usable=frames.usable, segments=frames.segment
     )
