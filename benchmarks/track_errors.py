@@ -40,8 +40,8 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
     resting = np.zeros(len(head.expression_names), np.float32)
     neutral = head.vertices(track.identity, resting).astype(np.float64)
     mean = head.template.astype(np.float64)
-    surface, frame = surface_error(neutral, track, fitted, head, truth)
-    errors = {"surface_mm": surface, "mean_surface_mm": surface_error(mean, track, fitted, head, truth)[0]}
+    surface, frame = surface_error(neutral, head, truth)
+    errors = {"surface_mm": surface, "mean_surface_mm": surface_error(mean, head, truth)[0]}
     if truth.vertices is not None:
         errors |= face_errors(neutral, track, fitted, judged, head, truth)
         frame = similarity(neutral[truth.vertices], truth.neutral)
@@ -56,12 +56,10 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
     }
 
 
-def surface_error(
-    neutral: F64, track: Track, fitted: F64, head: HeadModel, truth: GroundTruth
-) -> tuple[float, Similarity]:
+def surface_error(neutral: F64, head: HeadModel, truth: GroundTruth) -> tuple[float, Similarity]:
     """Mean distance of the face of a neutral [D, 3] m from the true surface, mm, after the similarity given with it."""
     face = head.regions["face"]
-    scale, turned, shift = _align(neutral[face], track, fitted, truth)
+    scale, turned, shift = _align(neutral[face], truth)
     distance, _ = cKDTree(truth.neutral).query(scale * neutral[face] @ turned.T + shift)
     near = distance < np.quantile(distance, 0.95)  # the two heads do not end at the same rim
     return 1e3 * float(distance[near].mean()), (scale, turned, shift)
@@ -205,13 +203,11 @@ def similarity(source: F64, target: F64, scaled: bool = True) -> Similarity:
     return scale, turned, target.mean(0) - scale * turned @ source.mean(0)
 
 
-def _align(source: F64, track: Track, fitted: F64, truth: GroundTruth) -> Similarity:
-    """Similarity from the fitted head frame to the true one, by nearest points of source [n, 3] m and the truth."""
-    first = int(np.flatnonzero(track.valid)[0])
-    scale = float(truth.translation[first, 2] / track.translation[first, 2] * track.focal / truth.focal)
-    turned = truth.rotation[first].T @ fitted[first]
-    # Not by the translations: with a wrong focal length they are centimetres apart.
-    shift = truth.neutral.mean(0) - scale * turned @ source.mean(0)
+def _align(source: F64, truth: GroundTruth) -> Similarity:
+    """Similarity between head frames whose axes point alike, by nearest points of source [n, 3] m and the truth."""
+    spread = [np.linalg.norm(points - points.mean(0), axis=1).mean() for points in (truth.neutral, source)]
+    scale, turned = float(spread[0] / spread[1]), np.eye(3)
+    shift = truth.neutral.mean(0) - scale * source.mean(0)
     tree = cKDTree(truth.neutral)
     for _ in range(40):
         # Both ways: nearest points from one side alone let the scale collapse.

@@ -148,6 +148,8 @@ def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str,
             video, truth = film(scene, head)
             yield ("own" if scene.bend_mm else "inside"), scene.name, watched(video, head), truth
     shared = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[2] / "shared"))
+    if not chosen and not (shared / "data/gt").is_dir():
+        print(f"no scan heads: {shared}/data/gt is not there; $PERSONALIZE_SHARED names the folder")
     for path in sorted((shared / "data/gt").glob("*.npz")):
         if wanted(path.stem, chosen):
             yield "shared", path.stem, watched(path.with_suffix(".mp4"), head), GroundTruth.load(path)
