@@ -24,6 +24,7 @@ from tracker.energy import (
     visibility,
 )
 from tracker.gaze import eye_rotations
+from tracker.rigid_pose import hold_poses
 from tracker.solver import Smoothness, solve_frames, solve_subject
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track, TrackError
 
@@ -50,8 +51,7 @@ def fit_track(
 ) -> Track:
     """The head's identity, and expression, pose and gaze in every frame, under the given camera.
 
-    bundle: not read: even the true poses, held in place of fitted ones, change the lips' error by 2-7 % only and
-    landmarks moved onto them by less; it stands here for a fit that reads pictures.
+    bundle: its poses take the place of the landmarks' own where the focal length is known, from it or given.
     usable: [T] bool, frames that may be measured. segment: [T], number of the uninterrupted shot;
     smoothness never crosses from one to another. Raises TrackError when no frame can be measured.
     """
@@ -63,7 +63,10 @@ def fit_track(
     keys = key_frames(observed, energy.px_per_m)
     energy = with_lips_shut(energy, start, keys[0])
     identity = fit_identity(energy, start, keys)
-    x = fit_frames(energy, start, identity, landmarks.time[good], _runs(good, segment), progress)
+    run = _runs(good, segment)
+    x = fit_frames(energy, start, identity, landmarks.time[good], run, progress)
+    if camera.method != "prior":
+        x = hold_poses(x, bundle, good, run)
     return _track(landmarks, camera, head, energy, observed, identity, x, good)
 
 

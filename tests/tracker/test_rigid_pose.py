@@ -1,0 +1,88 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tracker.energy import rotation_matrix, rotation_vector
+from tracker.rigid_pose import FADE, hold_poses
+from tracker.track import Bundle
+
+FRAMES, STEP = 90, 3
+GOOD = np.arange(FRAMES)
+RUN = np.zeros(FRAMES, np.int64)
+
+
+@pytest.fixture
+def truth() -> np.ndarray:
+    """[n, 8] two weights and a pose that swings."""
+    t = np.arange(FRAMES) / 25
+    turn = np.radians([6.0, 15.0, 3.0]) * np.sin(np.outer(t, [1.1, 1.6, 0.7]))
+    place = [0.0, 0.02, 0.6] + 0.02 * np.sin(np.outer(t, [1.3, 0.8, 1.0]))
+    return np.concatenate([np.full((FRAMES, 2), 0.3), turn, place], axis=1)
+
+
+def bundle_of(x: np.ndarray, frames: np.ndarray) -> Bundle:
+    """Exact poses of every STEP-th frame, of a head frame that is turned, moved and 4 % larger."""
+    turn, shift = Rotation.from_rotvec([0.03, -0.02, 0.01]).as_matrix(), np.array([0.002, -0.001, 0.09])
+    own = rotation_matrix(x[frames, -6:-3])
+    translation = 1.04 * (x[frames, -3:] + own @ shift)
+    empty = np.zeros((0, 3), np.float32)
+    return Bundle(
+        frame=frames.astype(np.int32),
+        rotation=Rotation.from_matrix(own @ turn).as_rotvec().astype(np.float32),
+        translation=translation.astype(np.float32),
+        points=empty,
+        observations=np.zeros((0, 4), np.float32),
+    )
+
+
+def drifted(x: np.ndarray) -> np.ndarray:
+    """The poses as landmarks give them: off by up to two degrees, slowly; right on average."""
+    drift = np.radians(2.0) * np.sin(2 * np.pi * np.arange(FRAMES) / FRAMES)
+    out = x.copy()
+    turn = Rotation.from_rotvec(np.outer(drift, [0.2, 1.0, 0.1])).as_matrix()
+    out[:, 2:5] = rotation_vector(turn @ rotation_matrix(x[:, 2:5]))
+    return out
+
+
+def error_deg(x: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    relative = rotation_matrix(x[:, 2:5]) @ rotation_matrix(truth[:, 2:5]).transpose(0, 2, 1)
+    return np.degrees(Rotation.from_matrix(relative).magnitude())
+
+
+def test_poses_come_to_the_bundle_and_weights_stay(truth):
+    start = drifted(truth)
+    held = hold_poses(start, bundle_of(truth, GOOD[::STEP]), GOOD, RUN)
+    assert error_deg(start, truth).mean() > 1.0
+    assert error_deg(held, truth).mean() < 0.1
+    assert np.abs(held[:, -3:] - truth[:, -3:]).max() < 0.002
+    np.testing.assert_array_equal(held[:, :2], start[:, :2])
+
+
+def test_frames_of_the_clip_that_are_not_measured_are_skipped(truth):
+    good = np.setdiff1d(GOOD, [0, 1, 30, 31])
+    start = drifted(truth)[good]
+    held = hold_poses(start, bundle_of(truth, GOOD[::STEP]), good, RUN[good])
+    assert error_deg(held, truth[good]).mean() < 0.1
+
+
+def test_nothing_is_carried_over_a_cut_nor_far_from_a_window(truth):
+    start = drifted(truth)
+    bundle = bundle_of(truth, GOOD[:30:STEP])
+    held = hold_poses(start, bundle, GOOD, (GOOD >= 30).astype(np.int64))
+    np.testing.assert_array_equal(held[30:], start[30:])
+    held = hold_poses(start, bundle, GOOD, RUN)
+    assert np.abs(held - start)[30 + FADE :].max() < 1e-12
+    step = np.diff(held[:, 2:5] - start[:, 2:5], axis=0)
+    assert np.degrees(np.abs(step)).max() < 0.3
+
+
+def test_without_a_bundle_or_with_one_of_no_rigid_body_poses_stay(truth):
+    start = drifted(truth)
+    none = bundle_of(truth, GOOD[:0])
+    np.testing.assert_array_equal(hold_poses(start, none, GOOD, RUN), start)
+    wild = bundle_of(truth, GOOD[::STEP])
+    noise = np.random.default_rng(0).normal(size=wild.rotation.shape).astype(np.float32)
+    wild = replace(wild, rotation=wild.rotation + 0.2 * noise)
+    np.testing.assert_allclose(hold_poses(start, wild, GOOD, RUN), start, atol=1e-12)

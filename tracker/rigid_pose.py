@@ -1,0 +1,80 @@
+"""Head poses held on the rigid upper face: what the bundle's feature tracks say against the landmarks' own poses.
+
+Landmarks err in blocks that move with the head, so a pose fitted to them swings by a degree. The bundle's poses do
+not, but they stand in a head frame of their own and exist on every third frame or so; the difference to the
+landmarks' poses, one similarity for each window taken out, is carried over to the frames between.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
+from scipy.spatial.transform import Rotation
+
+from tracker.energy import rotation_matrix, rotation_vector
+from tracker.track import F64, Bundle
+
+Rows = NDArray[np.int64]
+Corrections = list[tuple[Rows, F64]]
+
+MIN_FRAMES = 8  # of a window: fewer do not tell how the two head frames lie to each other
+PLAUSIBLE = np.radians(3.0)  # median turn between the two poses; a window beyond it is not of one rigid body
+FADE = 12  # frames beyond the end of a window over which its correction fades
+
+
+def hold_poses(x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64]) -> F64:
+    """The unknowns x [n, P] of the frames good [n] with their poses moved onto the bundle's.
+
+    run: [n], frames of one number follow each other without a break; nothing is carried from one to another.
+    """
+    known = np.isin(bundle.frame, good)
+    row = np.searchsorted(good, bundle.frame[known])
+    rotation = Rotation.from_rotvec(bundle.rotation[known]).as_matrix()
+    translation = bundle.translation[known].astype(np.float64)
+    step = np.median(np.diff(bundle.frame)) if len(bundle.frame) > 1 else 1
+    ends = np.flatnonzero((np.diff(row) > 1.5 * step) | (np.diff(run[row]) != 0)) + 1
+    out = x.copy()
+    found: dict[int, Corrections] = {}
+    for part in np.split(np.arange(len(row)), ends):
+        if len(part) < MIN_FRAMES:
+            continue
+        change = _corrections(x[row[part]], rotation[part], translation[part])
+        if np.median(np.linalg.norm(change[:, :3], axis=1)) <= PLAUSIBLE:
+            found.setdefault(int(run[row[part[0]]]), []).append((row[part], change))
+    for number, windows in found.items():
+        mine = np.flatnonzero(run == number)
+        change = _between(windows, mine)
+        turned = Rotation.from_rotvec(change[:, :3]).as_matrix() @ rotation_matrix(x[mine, -6:-3])
+        out[mine, -6:-3] = rotation_vector(turned)
+        out[mine, -3:] += change[:, 3:]
+    return out
+
+
+def _corrections(x: F64, rotation: F64, translation: F64) -> F64:
+    """[m, 6] turn (axis-angle, rad, camera frame) and shift (m) from the poses in x [m, P] to the bundle's.
+
+    The bundle's head frame is taken to the model's by the similarity under which the two are closest.
+    """
+    own, place = rotation_matrix(x[:, -6:-3]), x[:, -3:]
+    u, _, vt = np.linalg.svd((own.transpose(0, 2, 1) @ rotation).mean(0))
+    target = rotation @ (u @ vt).T
+    # The model's centre stands still in the bundle's frame, whose scale is its own: place = rotation c + s translation.
+    system = np.concatenate([rotation, translation[..., None]], axis=2).reshape(-1, 4)
+    moved = (system @ np.linalg.lstsq(system, place.reshape(-1), rcond=None)[0]).reshape(-1, 3)
+    turn = Rotation.from_matrix(target @ own.transpose(0, 2, 1)).as_rotvec()
+    change = np.concatenate([turn, moved - place], axis=1)
+    # Landmarks drift slowly; what changes from one known frame to the next is noise of either.
+    return convolve1d(change, [0.25, 0.5, 0.25], axis=0, mode="nearest")
+
+
+def _between(windows: Corrections, rows: Rows) -> F64:
+    """[len(rows), 6] corrections of all rows of one run: linear between those known, none far from all of them."""
+    known = np.concatenate([row for row, _ in windows])
+    change = np.concatenate([part for _, part in windows])
+    far = [edge for row, _ in windows for edge in (row[0] - FADE, row[-1] + FADE)]
+    far = [edge for edge in far if np.abs(known - edge).min() >= FADE]
+    places = np.concatenate([known, np.array(far, np.int64)])
+    values = np.concatenate([change, np.zeros((len(far), 6))])
+    order = np.argsort(places)
+    return np.stack([np.interp(rows, places[order], column) for column in values[order].T], axis=1)
