@@ -81,7 +81,7 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 2, ("focal_px",)
+    name, version, reads = "camera", 1, ("focal_px",)
     needs = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz")
     makes = ("camera.json", "bundle.npz")
 

@@ -49,8 +49,7 @@ def estimate_camera(
     """The camera of one clip and the rigid evidence for it, in the frame of the mean head.
 
     frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for each row of the landmarks. focal_given: px,
-    then nothing is estimated but poses and points, and those only where the head turns enough to tell them.
-    usable: [T] bool. segments: [T], number of the uninterrupted shot.
+    then nothing is estimated but poses and points. usable: [T] bool. segments: [T], number of the uninterrupted shot.
     """
     total = len(landmarks.time)
     usable = np.ones(total, bool) if usable is None else usable
@@ -63,10 +62,7 @@ def estimate_camera(
         return prior, _bundle(start)
     scene, focal, formal = found
     camera = prior
-    told = _tells_depth(scene, start)
-    if focal_given is not None and not told:
-        return prior, _bundle(_nothing())
-    if focal_given is None and told:
+    if focal_given is None and _tells_depth(scene, start):
         sd_log = _focal_sd_log(scene, focal, formal, prior)
         camera = _joined(prior, focal, float(np.hypot(sd_log, _start_dependence(start, prior, focal))))
     # Windows that fall back on their first poses must fit the final focal length, not the prior's.
@@ -215,11 +211,6 @@ def _pruned(scene: RigidScene) -> RigidScene:
         points=scene.points[kept],
         observations=np.column_stack([rows[:, 0], number, rows[:, 2:]]),
     )
-
-
-def _nothing() -> RigidScene:
-    frames, no_points = np.zeros(0, np.int32), np.zeros((0, 3))
-    return RigidScene(frames, np.zeros((0, 3, 3)), no_points, no_points, np.zeros((0, 4)), frames)
 
 
 def _scaled(scene: RigidScene, factor: float) -> RigidScene:

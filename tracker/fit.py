@@ -35,6 +35,8 @@ KEY_FRAMES = 48
 MIN_PRESENCE = 0.5
 REST_SHARE = 0.5  # of the key frames: frames at rest, which tell the neutral face
 LIP_BIAS = 0.001  # m
+# Of its logarithm. At .08 the bundle's poses err by half as much as the landmarks'; at .24, or unknown, by more.
+SURE_FOCAL = 0.15
 
 Frames = NDArray[np.int64]
 
@@ -51,7 +53,7 @@ def fit_track(
 ) -> Track:
     """The head's identity, and expression, pose and gaze in every frame, under the given camera.
 
-    bundle: its poses take the place of the landmarks' own where the focal length is known, from it or given.
+    bundle: its poses take the place of the landmarks' own where it tells the focal length well (SURE_FOCAL).
     usable: [T] bool, frames that may be measured. segment: [T], number of the uninterrupted shot;
     smoothness never crosses from one to another. Raises TrackError when no frame can be measured.
     """
@@ -65,7 +67,7 @@ def fit_track(
     identity = fit_identity(energy, start, keys)
     run = _runs(good, segment)
     x = fit_frames(energy, start, identity, landmarks.time[good], run, progress)
-    if camera.method != "prior":
+    if camera.method == "bundle" and camera.focal_sd_log <= SURE_FOCAL:
         x = hold_poses(x, bundle, good, run)
     return _track(landmarks, camera, head, energy, observed, identity, x, good)
 

@@ -105,10 +105,6 @@ def test_a_given_focal_length_is_kept(head: HeadModel, monkeypatch: pytest.Monke
     camera, bundle = estimate_camera(marks, lambda: [], head, focal_given=1000.0)
     assert (camera.method, camera.focal_px, camera.focal_sd_log) == ("given", 1000.0, 0.0)
     assert len(bundle.points) and len(bundle.frame) == len(marks.time)
-    marks, tracks, _ = _talk(head, 0.5)
-    _given(tracks, monkeypatch)
-    camera, bundle = estimate_camera(marks, lambda: [], head, focal_given=1000.0)
-    assert camera.method == "given" and not len(bundle.frame)
 
 
 def test_shots_are_held_apart_and_share_the_focal_length(
