@@ -49,7 +49,7 @@ def estimate_camera(
     """The camera of one clip and the rigid evidence for it, in the frame of the mean head.
 
     frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for each row of the landmarks. focal_given: px,
-    then nothing is estimated but poses and points, and those only where the head turns enough to tell them.
+    then nothing is estimated but poses and points.
     usable: [T] bool. segments: [T], number of the uninterrupted shot.
     """
     total = len(landmarks.time)

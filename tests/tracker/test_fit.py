@@ -79,6 +79,12 @@ def turn_error_deg(track, truth):
     return np.degrees(relative.magnitude())
 
 
+def swing_deg(track, truth):
+    """Mean rotation error without the constant difference of the two head frames."""
+    relative = Rotation.from_matrix(truth).inv() * Rotation.from_rotvec(track.rotation)
+    return np.degrees((relative * relative.mean().inv()).magnitude()).mean()
+
+
 def without_face(landmarks: Landmarks, gone: slice) -> Landmarks:
     points, presence = landmarks.points.copy(), landmarks.presence.copy()
     points[gone], presence[gone] = np.nan, 0
@@ -314,3 +320,19 @@ def test_progress_ends_at_its_total(talker):
     )
     assert seen[-1][0] == seen[-1][1]
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+@pytest.mark.parametrize(("sd_log", "held"), [(0.08, True), (0.3, False)])
+def test_poses_are_the_bundles_where_it_tells_the_focal_length(talker, track, sd_log: float, held: bool):
+    frames = np.arange(0, 150, 3, dtype=np.int32)
+    bundle = replace(
+        NO_BUNDLE,
+        frame=frames,
+        rotation=Rotation.from_matrix(talker.rotation[frames]).as_rotvec().astype(np.float32),
+        translation=talker.translation[frames].astype(np.float32),
+    )
+    camera = replace(CAMERA, method="bundle", focal_sd_log=sd_log)
+    everything = np.ones(150, bool), np.zeros(150, np.int32)
+    found = fit_track(talker.landmarks, camera, bundle, HEAD, *everything)
+    swing, free = swing_deg(found, talker.rotation), swing_deg(track, talker.rotation)
+    assert swing < 0.5 * free if held else swing == pytest.approx(free, rel=1e-6)
