@@ -177,7 +177,7 @@ class Overlay(Stage):
 class Registration(Stage):
     """Track -> Motion in the base model's topology, 30 fps, with the sound's offset."""
 
-    name, version = "registration", 1
+    name, version = "registration", 2
     needs = ("ingest/frames.npz", "ingest/audio.wav", "refine/track.npz")
     makes = ("motion.npz", "registration.json")
 
