@@ -31,6 +31,8 @@ from tracker.head import HeadModel
 from tracker.track import Track
 
 F32 = NDArray[np.float32]
+# The embedded head's mean is scaled to adults' mean distance between the pupils (tools/build_head.py).
+SCALE = "the head model's prior: a video does not show absolute size; the embedded head's eyes are 62 mm apart, sd 4"
 FRAMES_AT_ONCE = 256
 # A gap longer than this between two tracked frames is not bridged: nothing was seen there.
 LONGEST_BRIDGE_S = 0.15
@@ -129,7 +131,8 @@ def register(
     """The subject's motion in the base topology, and what registration did to it.
 
     segment: [T] i4, id of the uninterrupted shot of each frame; nothing is interpolated across two of them.
-    The report's keys: topology, transferred, transfer_residual_mm, projection_residual_mm, frames, valid_frames.
+    The report's keys: topology, head, transferred, transfer_residual_mm, projection_residual_mm, frames, valid_frames,
+    eye_distance_mm and scale, which says where absolute size comes from.
     """
     neutral = head.vertices(track.identity, np.zeros(track.expression.shape[1], np.float32))
     same = topology_hash(len(head.template), head.faces) == base.topology
@@ -153,8 +156,18 @@ def register(
         "projection_residual_mm": projection_mm,
         "frames": len(valid),
         "valid_frames": int(valid.sum()),
+        "eye_distance_mm": _eye_distance_mm(head, track.identity),
+        "scale": SCALE,
     }
     return motion, report
+
+
+def _eye_distance_mm(head: HeadModel, identity: F32) -> float:
+    left, right = (
+        joint.position + identity @ joint.identity_basis
+        for joint in (head.joints["left_eye"], head.joints["right_eye"])
+    )
+    return float(1e3 * np.linalg.norm(left - right))
 
 
 def _project(

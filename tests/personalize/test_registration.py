@@ -59,6 +59,7 @@ def test_same_topology_gives_back_the_displacements(head: HeadModel) -> None:
     motion, report = register(track_of(head, expression, time), np.zeros(60, np.int32), head, base)
     assert not report["transferred"]
     assert report["projection_residual_mm"] < 1e-3
+    assert 50 < report["eye_distance_mm"] < 75 and "prior" in report["scale"]
     assert motion.valid.all() and len(motion.valid) == 60
     for frame in (0, 17, 59):
         truth = np.tensordot(expression[frame], head.expression_basis, axes=1) * 1000

@@ -157,6 +157,7 @@ def test_gaze_follows_the_irises(talker, track):
     for side in range(2):
         yaw = track.eyes[open_eyes, side, 1]
         assert np.corrcoef(yaw, talker.eyes[open_eyes, side, 1])[0, 1] > 0.95
+        assert abs(np.polyfit(talker.eyes[open_eyes, side, 1], yaw, 1)[0] - 1) < 0.12
 
 
 def test_everything_has_its_shape_and_bounds(talker, track):
