@@ -147,12 +147,21 @@ def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str,
         if wanted(scene.name, chosen):
             video, truth = film(scene, head)
             yield ("own" if scene.bend_mm else "inside"), scene.name, watched(video, head), truth
-    shared = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[2] / "shared"))
-    if not chosen and not (shared / "data/gt").is_dir():
-        print(f"no scan heads: {shared}/data/gt is not there; $PERSONALIZE_SHARED names the folder")
-    for path in sorted((shared / "data/gt").glob("*.npz")):
+    for path in scan_heads():
         if wanted(path.stem, chosen):
             yield "shared", path.stem, watched(path.with_suffix(".mp4"), head), GroundTruth.load(path)
+
+
+def scan_heads() -> list[Path]:
+    """The truths of the shared data."""
+    shared = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[2] / "shared"))
+    return sorted((shared / "data/gt").glob("*.npz"))
+
+
+def known_names() -> list[str]:
+    """Of all clips."""
+    persons = [f"person{seed}" for seed in range(PERSONS)]
+    return [*persons, *(scene.name for scene in SCENES), *(path.stem for path in scan_heads())]
 
 
 def wanted(name: str, chosen: set[str]) -> bool:
@@ -188,15 +197,20 @@ def main() -> None:
     parser.add_argument("clips", nargs="*", metavar="NAME | VIDEO")
     named = parser.parse_args().clips
     videos = [Path(name) for name in named if Path(name).suffix]
+    chosen = {name for name in named if not Path(name).suffix}
+    if unknown := chosen - set(known_names()):
+        parser.error(f"no clip {', '.join(sorted(unknown))}; there are {', '.join(known_names())}")
+    if not named and not scan_heads():
+        print("without rendered scan heads: $PERSONALIZE_SHARED does not name a folder with data/gt")
     head, rows = load_head(), list[Row]()
-    print(f"{'clip':12s} {'stage':10s}", *(f"{name:>{max(6, len(name) + 1)}}" for name in COLUMNS), sep="")
-    if len(videos) < len(named) or not named:
-        for group, name, clip, truth in ground_truths(head, set(named)):
+    print(f"{'clip':16s} {'stage':10s}", *(f"{name:>{max(6, len(name) + 1)}}" for name in COLUMNS), sep="")
+    if chosen or not named:
+        for group, name, clip, truth in ground_truths(head, chosen):
             for stage, track, spent in stages(clip, head):
                 errors = compare(track, head, truth) | {"ms": spent}
                 rows.append(Row(group, name, stage, errors))
                 cells = (cell(column, errors.get(key, np.nan)) for column, key in COLUMNS.items())
-                print(f"{name:12s} {stage:10s}", *cells, sep="", flush=True)
+                print(f"{name:16s} {stage:10s}", *cells, sep="", flush=True)
     for video in videos:
         clip = watched(video, head)
         for stage, track, spent in stages(clip, head):

@@ -1,0 +1,26 @@
+"""The command: one clip by name, and a name that is none."""
+
+import sys
+
+import pytest
+
+from benchmarks import tracking
+
+
+def test_one_clip_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(tracking, "PERSON_FRAMES", 60)
+    monkeypatch.setattr(sys, "argv", ["tracking", "person1"])
+    tracking.main()
+    header, row, *bars = [line for line in capsys.readouterr().out.splitlines() if line]
+    assert row.split()[:2] == ["person1", "landmarks"] and len(row) == len(header)
+    surface, mean = (float(row.split()[2 + k]) for k in range(2))
+    assert surface < mean
+    assert any(line.startswith("in model: rotation") for line in bars)
+
+
+def test_unknown_clip_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["tracking", "nobody"])
+    with pytest.raises(SystemExit) as stopped:
+        tracking.main()
+    assert stopped.value.code == 2
+    assert "no clip nobody; there are person0" in capsys.readouterr().err
