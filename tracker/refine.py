@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.confidence import TOLERATED
 from tracker.fit import make_track, resume, smoothness_between, undistorted_picture
 from tracker.skin_fit import Photometry, Subject, fit_stretch, learn_levels
 from tracker.track import F32, F64, Camera, Landmarks, Track
@@ -20,6 +19,8 @@ if TYPE_CHECKING:
 
 KEYS = 64  # frames, spread over the clip, that tell the albedo
 STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
+# Times the usual deviation of the skin or of the mouth's: well-fitted laughs and turns reach 2.8.
+TOLERATED = 3.0
 Frame = tuple[float, U8]
 
 
