@@ -203,8 +203,10 @@ def main() -> None:
     if not named and not scan_heads():
         print("without rendered scan heads: $PERSONALIZE_SHARED does not name a folder with data/gt")
     head, rows = load_head(), list[Row]()
-    print(f"{'clip':16s} {'stage':10s}", *(f"{name:>{max(6, len(name) + 1)}}" for name in COLUMNS), sep="")
     if chosen or not named:
+        print(
+            f"{'clip':16s} {'stage':10s}", *(f"{name:>{max(6, len(name) + 1)}}" for name in COLUMNS), sep=""
+        )
         for group, name, clip, truth in ground_truths(head, chosen):
             for stage, track, spent in stages(clip, head):
                 errors = compare(track, head, truth) | {"ms": spent}
@@ -216,7 +218,8 @@ def main() -> None:
         for stage, track, spent in stages(clip, head):
             figures = consistency(track, clip.landmarks) | {"ms": spent}
             print(f"{video.stem} {stage}", *(f"{k} {v:.3f}" for k, v in figures.items()), flush=True)
-    print_bars(rows)
+    if rows:
+        print_bars(rows)
 
 
 if __name__ == "__main__":
