@@ -13,8 +13,10 @@ TURNS_DEG = 10.0  # a head that turns less from its mean leaves the focal length
 GAIN = 0.3
 PHOTOMETRIC = ("opening_centred_mm", "rotation_deg", "jitter_mm")
 # A face that stands still has next to none of these and would only lower their means.
-OF_MOTION = ("lip_motion_mm", "lip_in_plane_mm", "lip_neutral_mm", "rotation_deg")
-OF_MOTION += ("opening_rmse_mm", "opening_centred_mm")
+OF_MOTION = (
+    *("lip_motion_mm", "lip_in_plane_mm", "lip_neutral_mm"),
+    *("opening_rmse_mm", "opening_centred_mm", "rotation_deg"),
+)
 STILL_MM = 0.05
 RAISED = 0.01  # as a share; less is a tie
 
