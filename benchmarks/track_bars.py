@@ -12,6 +12,12 @@ FILMS = ("inside", *OUTSIDE)
 TURNS_DEG = 10.0  # a head that turns less from its mean leaves the focal length undecided
 GAIN = 0.3
 PHOTOMETRIC = ("opening_centred_mm", "rotation_deg", "jitter_mm")
+# A face that stands still has next to none of these and would only lower their means.
+OF_MOTION = (
+    *("lip_motion_mm", "lip_in_plane_mm", "lip_neutral_mm"),
+    *("opening_rmse_mm", "opening_centred_mm", "rotation_deg"),
+)
+STILL_MM = 0.05
 RAISED = 0.01  # as a share; less is a tie
 
 
@@ -76,6 +82,8 @@ BARS = (
 def figure(row: Row, error: str) -> float:
     """An error of a row, or what follows from several."""
     errors = row.errors
+    if error in OF_MOTION and errors["lip_motion_truth"] < STILL_MM:
+        return np.nan
     if error == "turning_focal_pct":
         return abs(errors["focal_pct"]) if errors["turn_deg"] >= TURNS_DEG else np.nan
     if error == "surface_pct":

@@ -13,6 +13,7 @@ def rows() -> list[Row]:
             "jitter_mm": about,
             "focal_pct": focal,
             "turn_deg": turned,
+            "lip_motion_truth": 1.5,
             "surface_mm": 1.0,
             "mean_surface_mm": 2.0,
         }
@@ -37,6 +38,11 @@ def test_bars_look_at_the_last_stage_of_their_groups() -> None:
 
 def test_focal_counts_only_where_the_head_turns() -> None:
     assert Bar("focal", ("own", "shared"), "turning_focal_pct", 10, worst=True).reached(rows()) == 5
+
+
+def test_a_still_face_does_not_lower_the_mean_of_motion_errors() -> None:
+    still = Row("own", "d", "refined", {"opening_centred_mm": 0.0, "lip_motion_truth": 0.0})
+    assert Bar("about", ("own",), "opening_centred_mm", 0.6).reached([*last_stages(rows()), still]) == 0.5
 
 
 def test_printed_answers() -> None:
