@@ -77,6 +77,7 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
         "lip_motion_truth": float(np.linalg.norm(true - true.mean(0), axis=-1).mean()),
         "opening_r": float(np.corrcoef(gap, true_gap)[0, 1]),
         "opening_rmse_mm": float(np.sqrt(np.mean((gap - true_gap) ** 2))),
+        "opening_centred_mm": float((gap - true_gap).std()),
         "opening_slope": float(np.polyfit(true_gap, gap, 1)[0]),
         "closed_mm": float(np.median((gap - true_gap)[closed])) if closed.any() else float("nan"),
         "jitter_mm": float(np.linalg.norm(jitter, axis=-1).mean()),

@@ -23,6 +23,7 @@ from tracker.fit import fit_track
 from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, LEFT_EYE_OUTER, POINTS, RIGHT_EYE_OUTER
 from tracker.landmarker import track_landmarks
+from tracker.refine import refine_track
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
 
 FPS, SIZE, FOCAL, DISTANCE_M = 25.0, (1280, 720), 1500.0, 0.65
@@ -54,6 +55,20 @@ def fitted(
     usable = landmarks.presence > 0
     track = fit_track(landmarks, camera(landmarks.size, focal), NO_BUNDLE, head, usable, segment)
     return track, 1e3 * (time.perf_counter() - start) / len(usable)
+
+
+def refined(
+    track: Track,
+    landmarks: Landmarks,
+    focal: float,
+    head: HeadModel,
+    segment: NDArray[np.int32],
+    film: Path,
+) -> tuple[Track, float]:
+    """The track after the photometric stage, and the time that took, ms a frame."""
+    start, lens = time.perf_counter(), camera(landmarks.size, focal)
+    after = refine_track(track, landmarks, lens, head, segment, lambda: read_frames(film))
+    return after.track, 1e3 * (time.perf_counter() - start) / len(landmarks.time)
 
 
 def talking_head(head: HeadModel, frames: int, seed: int) -> tuple[GroundTruth, Landmarks]:
@@ -115,10 +130,13 @@ def rendered(head: HeadModel, folder: Path) -> None:
     print("\nrendered heads outside the model (shared data), focal 1.2 times the long side and the true one")
     for path in sorted(folder.glob("*.npz")):
         truth = GroundTruth.load(path)
-        landmarks, segment = detected(path.with_suffix(".mp4"))
+        film = path.with_suffix(".mp4")
+        landmarks, segment = detected(film)
         for name, focal in (("1.2", 1.2 * max(landmarks.size)), ("true", truth.focal)):
             track, spent = fitted(landmarks, focal, head, segment)
             show(f"{path.stem} f={name}", compare(track, head, truth) | {"ms_per_frame": spent})
+            track, spent = refined(track, landmarks, focal, head, segment, film)
+            show(f"{path.stem} f={name} refined", compare(track, head, truth) | {"ms_per_frame": spent})
 
 
 def real(head: HeadModel, videos: list[Path], seconds: float) -> None:
