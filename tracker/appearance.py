@@ -23,9 +23,7 @@ Bool = NDArray[np.bool_]
 POINTS = 3000
 INSIDE = ("mouth", "teeth", "tongue", "eyes", "eyelids")  # regions that are no skin, or turn out of sight
 MOUTH_M = 0.015  # from the lips: skin that belongs to the mouth
-DENSER = (
-    8  # times as many points along the inner lips as they have vertices: their distance is that of the line
-)
+DENSER = 8  # points along each edge of the inner lips: their distance is that of the line
 COARSE = 0.4  # of the picture's size is enough for the raster that tells what hides what
 MARGIN_M = 0.004  # how far behind the raster's surface skin may lie and still be seen
 FACING = 0.25  # cosine to the line of sight below which skin is too oblique to compare
@@ -77,7 +75,7 @@ def skin_of(head: HeadModel, model: LandmarkModel, identity: F32) -> Skin:
 
 def _to_line(points: F32, lines: Sequence[F32]) -> F32:
     """[P] m from points [P, 3] to the nearest of lines [.., 3]."""
-    share = np.linspace(0, 1, DENSER, endpoint=False)[:, None, None]
+    share = np.linspace(0, 1, DENSER)[:, None, None]
     dense = [(line[:-1] + share * np.diff(line, axis=0)).reshape(-1, 3) for line in lines]
     return cKDTree(np.concatenate(dense)).query(points)[0].astype(np.float32)
 

@@ -131,14 +131,14 @@ class Subject:
 def learn_levels(subject: Subject, cuts: Sequence[U8], rows: Index, x: F64) -> list[Level]:
     """What the skin looks like through each blur, from frames `rows` at their landmark fit x [n, U].
 
-    A finer albedo comes from where the coarser one put the frames. Their mean stays that of the landmark fit: an
-    albedo that follows the fit freely lets the mean opening of the mouth drift.
+    Once and never again: an albedo that follows the fit lets the mean opening of the mouth drift, and a slow turn of
+    the head keep the error that wrong depths of the face gave it.
     """
     seen, basis = subject.look(rows, x)
     levels, now = [], x
     for blur in subject.blurs_px:
         energy = subject.photometric(cuts, rows, seen, blur)
-        grey = energy.grey(now)
+        grey = energy.grey(x)
         albedo, usual = appearance(grey, basis, seen)
         expected = shaded(albedo, basis, frame_light(grey, albedo, basis, seen, usual))
         noise = _noise(grey - expected, seen > 0, subject.skin.mouth)
@@ -167,15 +167,15 @@ def _steadied(
 ) -> tuple[PhotometricEnergy, F64]:
     """The energy with a pull under which the frames' mean stays that of `anchor`, and where they then go from x.
 
-    The method of multipliers on that mean: only grey levels' differences between frames are evidence. Half steps:
-    bounds and other frames' stiffness make whole ones overshoot.
+    The method of multipliers on that mean: only grey levels' differences between frames are evidence. The frames give
+    way by the mean of their compliances, which what is soft in one of them makes far from the mean stiffness' inverse.
     """
     shape = subject.energy.shape(subject.identity.astype(np.float64))
     alone = Smoothness.between(np.arange(len(x)), np.zeros(x.shape[1]))
     x, _ = solve_frames(energy, shape, x, alone, steps=subject.photometry.steps)
     drift = (x - anchor).mean(0)
-    stiffness = energy.linearize(shape, x).hessian.mean(0)
-    return replace(energy, pull=energy.pull - 0.5 * stiffness @ drift), x
+    compliance = np.linalg.inv(energy.linearize(shape, x).hessian).mean(0)
+    return replace(energy, pull=energy.pull - np.linalg.solve(compliance, drift)), x
 
 
 def fit_stretch(

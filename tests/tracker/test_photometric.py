@@ -5,10 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.flame_factory import FakeFlame
+from tests.tracker.test_flame import arrays, surface
 from tracker.appearance import HARMONICS, appearance, frame_light, harmonics, shaded, skin_of
 from tracker.energy import POSE, Energy, Weights, landmark_model
+from tracker.flame import flame_head
 from tracker.head import load_head
 from tracker.photometric import PhotometricEnergy
+from tracker.skin_fit import LEAST_NOISE, _noise
 from tracker.view import View, Window
 
 HEAD = load_head()
@@ -125,3 +129,40 @@ def test_sample_points_lie_on_skin_alone():
     assert (skin.barycentric >= 0).all()
     np.testing.assert_allclose(skin.barycentric.sum(1), 1, rtol=1e-5)
     assert 0.1 < skin.mouth.mean() < 0.7
+
+
+def test_points_know_how_far_the_mouths_inside_is():
+    skin = skin_of(HEAD, MODEL, IDENTITY)
+    inner = np.concatenate([HEAD.regions[f"inner_lip_{lip}"] for lip in ("upper", "lower")])
+    vertices = HEAD.template[inner] - MODEL.centre
+    to_vertex = np.linalg.norm(skin.rest[:, None] - vertices, axis=-1).min(1)
+    assert (skin.to_inside <= to_vertex + 1e-6).all()
+    assert skin.to_inside.min() < 0.002 and skin.to_inside[~skin.mouth].min() > 0.01
+
+
+def test_skin_moves_as_a_flame_head_does():
+    fake = FakeFlame()
+    flame = flame_head("flame", arrays(fake), surface(fake), {})
+    model = landmark_model(flame, Weights())
+    identity = np.zeros(len(flame.identity_basis), np.float32)
+    skin = skin_of(flame, model, identity)
+    weights = np.zeros(model.expressions)
+    weights[:3], weights[-2] = (0.5, -0.4, 0.3), 1.0  # shapes, and the jaw at the step of its chord
+    expression, jaw = (part.astype(np.float32) for part in model.modes.head_weights(weights))
+    posed = flame.vertices(identity, expression, jaw=jaw)
+    expected = np.einsum("pc,pcx->px", skin.barycentric, posed[flame.faces[skin.triangles]])
+    np.testing.assert_allclose(skin.rest + skin.expression @ weights + model.centre, expected, atol=3e-4)
+    assert skin.mouth.any() and not skin.mouth.all()
+    np.testing.assert_allclose(model.modes.of_head(expression, jaw), weights, atol=1e-6)
+
+
+def test_only_the_mouth_has_noise_of_its_own():
+    rng = np.random.default_rng(2)
+    error = rng.normal(size=(200, 90)).astype(np.float32) * 3
+    error[:, 40:50] *= 4
+    seen, mouth = np.ones(error.shape, bool), np.arange(90) >= 45
+    seen[:, 89] = False
+    noise = _noise(error, seen, mouth)
+    assert noise[45:50] == pytest.approx(12, rel=0.25)
+    assert noise[:45] == pytest.approx(noise[0]) and noise[89] == noise[0]
+    assert (_noise(error, np.zeros_like(seen), mouth) == LEAST_NOISE).all()
