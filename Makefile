@@ -15,8 +15,9 @@ run: $(READY)
 	@test -n "$(VIDEO)" || { echo "usage: make run VIDEO=talk.mp4 [ARGS='--out DIR']" >&2; exit 2; }
 	$(BIN)/personalize run "$(VIDEO)" $(ARGS)
 
+# A file's tests stay together: they share what is slow to make.
 test: $(READY)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .
