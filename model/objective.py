@@ -84,8 +84,9 @@ class Objective(nn.Module):
 
     def forward(self, batch: Batch, draws: Draws) -> Tensor:
         """Scalar; see `objective`."""
-        kind = batch.motion.device.type
-        with torch.autocast(kind, torch.bfloat16, enabled=self._precision == "bfloat16"):
+        kind, lower = batch.motion.device.type, self._precision == "bfloat16"
+        # Casts are kept for all threads together: which of two finds the other's would decide the rounding.
+        with torch.autocast(kind, torch.bfloat16, enabled=lower, cache_enabled=False):
             x_t = self._diffusion.add_noise(batch.motion, draws.t, draws.noise)
             condition = self.network.condition(batch.audio * draws.channels, draws.keep)
             output = self.network(x_t, draws.t, condition, batch.style).float()

@@ -209,6 +209,13 @@ def test_draws_zero_as_many_channels_and_conditions_as_asked() -> None:
     assert torch.equal(half.noise, draws.noise[:, 1::2]) and torch.equal(half.t, draws.t[1::2])
 
 
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_two_threads_repeat_to_the_byte(tmp_path: Path, precision: str) -> None:
+    config = replace(TINY, iterations=120, candidates=1, batch=16, threads=2, precision=precision)
+    first, second = (Trainer(*start(), tmp_path / name, config).train()[0] for name in ("one", "two"))
+    assert_equal(first, second)
+
+
 def test_bfloat16_follows_float32(tmp_path: Path) -> None:
     losses = []
     for precision in ("float32", "bfloat16"):

@@ -100,7 +100,8 @@ def test_resume_is_the_inverse_of_make_track(film: Film):
 def test_pictures_lower_the_error(film: Film):
     refined = film.refine()
     assert turn_error_deg(refined.track, film.rotation) < 0.7 * turn_error_deg(film.track, film.rotation)
-    assert opening_error_mm(refined.track, film.gap) < 0.95 * opening_error_mm(film.track, film.gap)
+    # Openings are left to the landmarks, which tell those of this film to a quarter of a millimetre.
+    assert opening_error_mm(refined.track, film.gap) < opening_error_mm(film.track, film.gap)
     np.testing.assert_array_equal(refined.track.identity, film.track.identity)
     assert np.nanmedian(refined.photometric) == pytest.approx(1, abs=1e-5)
 
