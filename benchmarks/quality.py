@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from model.checkpoint import Checkpoint
 from model.dataset import Sequence
 from model.diffusion import STEPS
-from model.finetuning import SWEEP, choose_checkpoint, subject_of
+from model.finetuning import EARLY_TOLERANCE, SWEEP, choose_checkpoint, subject_of
 from model.metrics import lip_gap_r, lip_opening_mm, score
 from model.ridge import Ridge
 from model.speech import load_encoder
@@ -120,7 +120,7 @@ def trained(
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         candidates = Trainer(subject, train, Path(folder), config).train()
-        best, errors = choose_checkpoint(candidates, val, seed=0)
+        best, errors = choose_checkpoint(candidates, val, 0, EARLY_TOLERANCE)
         if last:
             best = Checkpoint.load(candidates[-1])
     print(f"{config.iterations} iterations in {time.perf_counter() - started:.0f} s", end="; ")

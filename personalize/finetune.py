@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from model.finetuning import choose_checkpoint, subject_of, sweep_guidance
+from model.finetuning import EARLY_TOLERANCE, choose_checkpoint, subject_of, sweep_guidance
 from model.speech import load_encoder
 from model.trainer import Trainer
 from model.training_config import TrainingConfig
@@ -50,7 +50,7 @@ def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     )
     candidates = trainer.train(report.progress)
     report.say("choosing the checkpoint and the guidance scale on the validation split")
-    best, errors = choose_checkpoint(candidates, data.sequences("val"), settings.seed)
+    best, errors = choose_checkpoint(candidates, data.sequences("val"), settings.seed, EARLY_TOLERANCE)
     sweep, chosen = sweep_guidance(best, data.sequences("val"), settings.seed, report.progress)
     best.with_weights(best.network, best.ema, guidance=chosen).save(folder / "checkpoint.safetensors")
     choice = {"lip_error_mm": dict(zip([path.stem for path in candidates], errors))}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from model.architectures import ARCHITECTURES
+from model.checkpoint import Checkpoint
 from model.dataset import Standardization
 from model.finetuning import SWEEP, choose_checkpoint, subject_of, sweep_guidance
 from model.synthesis import synthesize
@@ -50,6 +51,8 @@ def test_the_candidate_that_is_nearest_on_validation_is_chosen(tmp_path: Path) -
     size = (0.5, 0.0, 0.9)[index]
     expected = talker.shaken(talker.checkpoint(sequences), seed=index).ema["encoder.weight"] * size
     assert np.allclose(best.ema["encoder.weight"], expected)
+    first, _ = choose_checkpoint(paths, sequences, seed=0, tolerance=2 * errors[0] / min(errors))
+    assert np.allclose(first.ema["encoder.weight"], Checkpoint.load(paths[0]).ema["encoder.weight"])
 
 
 def test_the_sweep_has_a_row_a_scale_and_keeps_to_the_best_synchrony() -> None:
