@@ -20,7 +20,7 @@ SMALLEST_SCALE = 0.01
 # A coefficient that is mostly still and seldom jumps (an eyelid) is scaled so that it hardly ever exceeds this value.
 # In standard deviations a blink may be 10: whether there is one would be decided by steps whose noise leaves nothing
 # else to see, and the model forgets to blink (docs/method.md).
-LARGEST_VALUE, LARGEST_QUANTILE = 6.0, 0.999
+LARGEST_VALUE, LARGEST_QUANTILE = 4.0, 0.999
 
 
 @dataclass(frozen=True)
