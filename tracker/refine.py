@@ -51,10 +51,8 @@ def refine_track(
     segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
     each row of the landmarks; it is called twice. A frame whose skin does not come nearer to what it should look
     like keeps its landmark fit, and so does one whose picture is missing. evidence: see `fit_track`.
-
-    On eight rendered clips, 66 to 207 px between the outer eye corners, the head's rotation errs less by 11 to 64 %
-    (on one of them 2 % more), jitter by 23 to 43 %, the lips' opening by 0 to 20 %: real faces' openings are left to
-    the landmarks, see `Photometry.pair_noise_mm`.
+    What it gains is printed by `python -m benchmarks tracking`: pose and jitter mostly; the lips' openings are left
+    to the landmarks, see `Photometry.pair_noise_mm`.
     """
     photometry = photometry or Photometry()
     energy, x, observed, good = resume(track, landmarks, camera, head, evidence)
