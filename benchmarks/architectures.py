@@ -134,6 +134,7 @@ def main() -> None:
     parser.add_argument("--guidance", type=float, nargs="+", default=[1.0, 0.5])
     parser.add_argument("--steps", type=int, default=STEPS, help="of the reverse chain")
     parser.add_argument("--threads", type=int, default=TrainingConfig.threads)
+    parser.add_argument("--device", default=TrainingConfig.device)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     base = Checkpoint.load(BASE_CHECKPOINT)
@@ -147,7 +148,11 @@ def main() -> None:
     still = [np.broadcast_to(mean, (1, *q.coefficients.shape)) for q in test]
     print(table_row("mean motion", [score(drawn, q, base) for drawn, q in zip(still, test)], test))
     config = TrainingConfig(
-        iterations=options.iterations, candidates=1, threads=options.threads, seed=options.seed
+        iterations=options.iterations,
+        candidates=1,
+        threads=options.threads,
+        device=options.device,
+        seed=options.seed,
     )
     for architecture in ARCHITECTURES:
         start = untrained(base, train, architecture, options.parametrization)

@@ -142,6 +142,7 @@ def main() -> None:
     parser.add_argument("--ema", type=float, default=defaults.ema)
     parser.add_argument("--metric-power", type=float, default=defaults.metric_power)
     parser.add_argument("--precision", choices=("auto", "float32", "bfloat16"), default=defaults.precision)
+    parser.add_argument("--device", default=defaults.device)
     parser.add_argument("--parametrization", choices=("skip", "plain"), default="skip")
     parser.add_argument("--scratch", action="store_true", help="do not start from the base model's weights")
     parser.add_argument("--steps", type=int, default=STEPS, help="of sampling")

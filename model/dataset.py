@@ -106,16 +106,18 @@ class Batch:
         """Some of its crops."""
         return Batch(self.motion[:, rows], self.audio[:, rows], self.style[rows])
 
-    def to(self, device: str) -> Batch:
-        """On a device."""
-        return Batch(self.motion.to(device), self.audio.to(device), self.style.to(device))
-
 
 class Crops:
     """All crops of `length` frames that lie inside runs of valid frames, equally likely."""
 
-    def __init__(self, sequences: Many[Sequence], standardization: Standardization, length: int) -> None:
-        """Raises ModelError where no run of valid frames is long enough."""
+    def __init__(
+        self,
+        sequences: Many[Sequence],
+        standardization: Standardization,
+        length: int,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        """device: that batches are made on. Raises ModelError where no run of valid frames is long enough."""
         starts, offset = [], 0
         for sequence in sequences:
             runs = np.convolve(sequence.valid, np.ones(length, dtype=int), mode="full")[length - 1 :]
@@ -126,11 +128,10 @@ class Crops:
             raise ModelError(
                 f"no {length} consecutive valid frames: too little of the face was tracked to learn from"
             )
-        self._motion = standardization.motion(
-            np.nan_to_num(np.concatenate([s.coefficients for s in sequences]))
-        )
-        self._audio = standardization.audio(np.concatenate([s.features for s in sequences]))
-        self._style = torch.from_numpy(np.concatenate([np.full(len(s.valid), s.style) for s in sequences]))
+        motion = standardization.motion(np.nan_to_num(np.concatenate([s.coefficients for s in sequences])))
+        audio = standardization.audio(np.concatenate([s.features for s in sequences]))
+        style = torch.from_numpy(np.concatenate([np.full(len(s.valid), s.style) for s in sequences]))
+        self._motion, self._audio, self._style = motion.to(device), audio.to(device), style.to(device)
         self._within = torch.arange(length)[:, None]
 
     def __len__(self) -> int:
@@ -139,5 +140,5 @@ class Crops:
     def draw(self, count: int, generator: torch.Generator) -> Batch:
         """`count` random crops."""
         first = self._starts[torch.randint(len(self._starts), (count,), generator=generator)]
-        index = first + self._within
-        return Batch(self._motion[index], self._audio[index], self._style[first])
+        index = (first + self._within).to(self._motion.device)
+        return Batch(self._motion[index], self._audio[index], self._style[index[0]])

@@ -82,6 +82,12 @@ class Diffusion:
         sd = torch.ones(1) if spread is None else spread
         self._skip, self._gain = preconditioning(self.alphas[:, None], sd.double())
 
+    def to(self, device: torch.device) -> Diffusion:
+        """Itself, with its tables on a device."""
+        for name in ("_signal", "_noise", "_skip", "_gain"):
+            setattr(self, name, getattr(self, name).to(device))
+        return self
+
     def add_noise(self, x0: Tensor, t: Tensor, noise: Tensor) -> Tensor:
         """q(x_t | x0) = N(sqrt(abar_t) x0, (1 - abar_t) I), at the given unit noise; t [*b], x0 [N, *b,
         K].
@@ -97,11 +103,11 @@ class Diffusion:
         """
         if self.parametrization == "plain":
             return output
-        return self._skip.to(t.device)[t] * x_t + self._gain.to(t.device)[t] * output
+        return self._skip[t] * x_t + self._gain[t] * output
 
     def _levels(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """sqrt(abar_t) and sqrt(1 - abar_t) of steps t [*b], [*b, 1] each, on their device."""
-        return self._signal.to(t.device)[t][..., None], self._noise.to(t.device)[t][..., None]
+        """sqrt(abar_t) and sqrt(1 - abar_t) of steps t [*b], [*b, 1] each."""
+        return self._signal[t][..., None], self._noise[t][..., None]
 
     def times(self, steps: int | None, rule: Rule) -> list[int]:
         """The diffusion steps that a reverse chain visits, from noise to clean."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from collections.abc import Sequence as Many
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -21,7 +21,7 @@ from model.checkpoint import Checkpoint, State, read_tensors, serialize, write_a
 from model.dataset import Batch, Crops, Sequence
 from model.diffusion import Diffusion, Progress
 from model.errors import ModelError
-from model.objective import Draws, Objective, SharedGradient, coefficient_weights
+from model.objective import Draws, Gradient, Objective, coefficient_weights, gradient_of
 from model.training_config import TrainingConfig, available_device, settled
 from model.training_log import TrainingLog
 
@@ -54,16 +54,17 @@ class Trainer:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._checkpoint = checkpoint
         self._tensorboard = tensorboard
-        self._crops = Crops(sequences, checkpoint.standardization, self.config.frames)
+        self._device = available_device(self.config.device)
+        self._crops = Crops(sequences, checkpoint.standardization, self.config.frames, self._device)
         weights = coefficient_weights(
             torch.from_numpy(checkpoint.standardization.scale), self.config.metric_power
         )
-        self._diffusion: Diffusion = checkpoint.diffusion()
+        self._diffusion: Diffusion = checkpoint.diffusion().to(self._device)
         self._network = build_network(checkpoint.config)
         self._network.load_state_dict(checkpoint.network)
         objective = Objective(self._network, self._diffusion, weights, self.config)
-        objective.to(available_device(self.config.device))
-        self._gradient: Callable[[Batch, Draws], Tensor] = SharedGradient(objective, self.config.threads)
+        objective.to(self._device)
+        self._gradient: Gradient = gradient_of(objective, self.config.threads)
         self._rank, self._world = (0, 1)
         if distributed.is_initialized():
             self._rank, self._world = distributed.get_rank(), distributed.get_world_size()
@@ -127,8 +128,7 @@ class Trainer:
         batch = self._crops.draw(self.config.batch, generator)
         draws = Draws.of(batch, self._diffusion.steps, self.config, generator)
         mine = slice(self._rank, None, self._world)
-        device = self.config.device
-        loss = self._gradient(batch.part(mine).to(device), draws.part(mine).to(device))
+        loss = self._gradient(batch.part(mine), draws.part(mine).to(self._device))
         self._optimizer.step()
         self._follow()
         return loss
@@ -194,16 +194,16 @@ class Trainer:
                 f"{path} belongs to a training with other settings or data; remove its folder to start anew"
             )
         self._network.load_state_dict({n: tensors[f"network.{n}"] for n in self._network.state_dict()})
-        self._average = {n: tensors[f"average.{n}"].to(self.config.device) for n in self._average}
+        self._average = {n: tensors[f"average.{n}"].to(self._device) for n in self._average}
         for index, parameter in enumerate(self._parameters):
             names = ("step", "exp_avg", "exp_avg_sq")
-            state = {name: tensors[f"adam.{index}.{name}"].to(self.config.device) for name in names}
+            state = {name: tensors[f"adam.{index}.{name}"].to(self._device) for name in names}
             self._optimizer.state[parameter] = state
-        self._losses = list(tensors["losses"].to(self.config.device))
+        self._losses = list(tensors["losses"].to(self._device))
         self.step = int(metadata["step"])
 
 
-def _averaged(objective: DistributedDataParallel) -> Callable[[Batch, Draws], Tensor]:
+def _averaged(objective: DistributedDataParallel) -> Gradient:
     """Loss of this process's share of a batch; the gradients become the mean of all processes'."""
 
     def gradient(batch: Batch, draws: Draws) -> Tensor:

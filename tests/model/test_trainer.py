@@ -14,7 +14,7 @@ from model.checkpoint import Checkpoint
 from model.dataset import Batch, Crops
 from model.errors import ModelError
 from model.metrics import score
-from model.objective import Draws, Objective, SharedGradient, coefficient_weights
+from model.objective import Draws, GraphedGradient, Objective, SharedGradient, coefficient_weights
 from model.synthesis import synthesize
 from model.trainer import LOG_FILE, STATE_FILE, Trainer, TrainingDivergedError
 from model.training_config import TrainingConfig, settled
@@ -23,6 +23,8 @@ from tests.model import talker
 TINY = TrainingConfig(
     iterations=24, batch=4, frames=12, candidates=3, log_every=5, threads=1, precision="float32"
 )
+
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
 
 def start() -> tuple[Checkpoint, list]:
@@ -45,10 +47,13 @@ class Killed(Exception):  # noqa: N818
     """Stands for a kill."""
 
 
-@pytest.mark.parametrize(("step", "threads"), [(5, 1), (15, 2)])
-def test_a_killed_training_goes_on_bit_for_bit(tmp_path: Path, step: int, threads: int) -> None:
+@pytest.mark.parametrize(
+    ("step", "threads", "device"),
+    [(5, 1, "cpu"), (15, 2, "cpu"), pytest.param(15, 1, "cuda", marks=needs_cuda)],
+)
+def test_a_killed_training_goes_on_bit_for_bit(tmp_path: Path, step: int, threads: int, device: str) -> None:
     checkpoint, sequences = start()
-    config = replace(TINY, threads=threads)
+    config = replace(TINY, threads=threads, device=device)
 
     def kill(done: int, total: int) -> None:
         if done == step:
@@ -241,10 +246,36 @@ def test_what_the_machine_decides_is_settled_once() -> None:
     assert settled(TrainingConfig(precision="float32", threads=4)).threads == 4
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_cuda_learns_what_the_processor_does(tmp_path: Path) -> None:
-    here = Trainer(*start(), tmp_path / "cpu", TINY).train()[-1]
-    there = Trainer(*start(), tmp_path / "cuda", replace(TINY, device="cuda")).train()[-1]
+@needs_cuda
+@pytest.mark.parametrize("architecture", ["conv", "attention", "transformer"])
+def test_cuda_learns_what_the_processor_does(tmp_path: Path, architecture: str) -> None:
+    checkpoint, sequences = start()
+    checkpoint = talker.checkpoint(sequences, styles=2, architecture=architecture)
+    here = Trainer(checkpoint, sequences, tmp_path / "cpu", TINY).train()[-1]
+    there = Trainer(checkpoint, sequences, tmp_path / "cuda", replace(TINY, device="cuda")).train()[-1]
     ours, theirs = weights(here), weights(there)
     for name, value in ours.items():
         torch.testing.assert_close(value, theirs[name], atol=1e-2, rtol=1e-2)
+
+
+@needs_cuda
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_recorded_gradient_is_the_gradient(precision: str) -> None:
+    checkpoint, sequences = start()
+    config = TrainingConfig(precision=precision)
+    device = torch.device("cuda")
+    objective = Objective(
+        checkpoint.model(), checkpoint.diffusion().to(device), torch.full((talker.K,), 0.1), config
+    ).to(device)
+    gradient, generator = GraphedGradient(objective), torch.Generator().manual_seed(0)
+    crops = Crops(sequences, checkpoint.standardization, 12, device)
+    for _ in range(3):
+        batch = crops.draw(16, generator)
+        draws = Draws.of(batch, 500, config, generator).to(device)
+        loss = gradient(batch, draws)
+        whole = objective(batch, draws)
+        torch.testing.assert_close(loss, whole.detach())
+        for parameter, value in zip(
+            objective.parameters(), torch.autograd.grad(whole, list(objective.parameters()))
+        ):
+            torch.testing.assert_close(parameter.grad, value)
