@@ -267,6 +267,7 @@ def test_a_recorded_gradient_is_the_gradient(precision: str) -> None:
     objective = Objective(
         checkpoint.model(), checkpoint.diffusion().to(device), torch.full((talker.K,), 0.1), config
     ).to(device)
+    objective.requires_grad_(True)
     gradient, generator = GraphedGradient(objective), torch.Generator().manual_seed(0)
     crops = Crops(sequences, checkpoint.standardization, 12, device)
     for _ in range(3):
