@@ -8,6 +8,7 @@ penalty that val chose before. With --trained nothing is trained: it is the run'
 r               of the lip opening with the reference: mean of 10 samples at s = 1, and of the ridge regression from the
                 same speech features on the same seconds; `training` is on the training seconds
 sd              over samples at s = 0.5 by the motion's own: lip opening, mouth width, eyelid opening
+speed           mean change from frame to frame of the same three, by the subject's own: noise is no variety
 spread, velocity    of samples, by the subject's own; at s = 0 without the speech
 
 The second table (--curve) is the guidance curve: div_e and lip_sync for s = 0 ... 1.
@@ -38,6 +39,7 @@ from personalize.subject_data import BASE_CHECKPOINT, load_subject_data
 from tracker.head import load_head
 
 F32 = NDArray[np.float32]
+SIGNALS = ("lips", "width", "lids")
 SAMPLES = 10
 CURVE_SAMPLES = 4
 
@@ -75,7 +77,12 @@ def together(checkpoint: Checkpoint, drawn: list[F32], sequences: list[Sequence]
     scores = [score(d, s, checkpoint) for d, s in zip(drawn, sequences)]
     figures = {name: weighted([row[name] for row in scores], sequences) for name in scores[0]}
     figures["r"] = lip_gap_r(ours["lips"].mean(0), true["lips"])
-    return figures | {f"sd {name}": float(ours[name].std(0).mean() / true[name].std()) for name in ours}
+    for name in ours:
+        figures[f"sd {name}"] = float(ours[name].std(0).mean() / true[name].std())
+        figures[f"speed {name}"] = float(
+            np.abs(np.diff(ours[name])).mean() / np.abs(np.diff(true[name])).mean()
+        )
+    return figures
 
 
 def draw(checkpoint: Checkpoint, sequences: list[Sequence], s: float, samples: int, steps: int) -> list[F32]:
@@ -97,8 +104,11 @@ def report(
     print(f"r     mean of {SAMPLES}, s = 1: {at[1.0]['r']:.3f}   ridge {predicted['r']:.3f}", end="   ")
     print(f"single {at[1.0]['lip_gap_r']:.3f}   training {known['r']:.3f}")
     for s, row in at.items():
-        sds = "   ".join(f"{name[3:]} {value:.2f}" for name, value in row.items() if name.startswith("sd "))
-        print(f"s = {s}   sd {sds}   spread {row['spread']:.2f}   velocity {row['velocity']:.2f}")
+        sds, speeds = (
+            "   ".join(f"{name} {row[f'{kind} {name}']:.2f}" for name in SIGNALS) for kind in ("sd", "speed")
+        )
+        print(f"s = {s}   sd {sds}   speed {speeds}", end="   ")
+        print(f"spread {row['spread']:.2f}   velocity {row['velocity']:.2f}")
     print(f"ridge     spread {predicted['spread']:.2f}   velocity {predicted['velocity']:.2f}", flush=True)
 
 

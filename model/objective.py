@@ -14,19 +14,24 @@ from model.denoiser import Denoiser
 from model.diffusion import Diffusion
 from model.training_config import TrainingConfig
 
+# What is still for longer than this is not made important.
+SMALLEST_SPREAD = 0.25
+
 # Sets every parameter's `grad` to that of the batch's mean loss, which is returned: a scalar.
 Gradient = Callable[[Batch, "Draws"], Tensor]
 
 
-def coefficient_weights(scale: Tensor, power: float) -> Tensor:
-    """[K]: what a standardized squared residual weighs in the loss, scale^power, summing to 1.
+def coefficient_weights(scale: Tensor, spread: Tensor, power: float) -> Tensor:
+    """[K]: what a standardized squared residual weighs in the loss, so that a squared residual in the coefficient's own
+    standard deviations, scale spread, weighs their power.
 
     Power 2 is the vertex metric: the basis is orthonormal, so sum_k scale_k^2 r_k^2 is the squared vertex distance.
     There the small coefficients get no gradient to speak of, and are sampled as white noise that shakes the face; a
     power of 1/2 measured best (docs/method.md). A loss of 1 is what predicting the mean motion costs.
     """
-    weights = scale**power
-    return weights / weights.sum()
+    seen = spread.clamp(min=SMALLEST_SPREAD)
+    weights = (scale * seen) ** power / seen**2
+    return weights / (weights * spread**2).sum()
 
 
 def objective(x0: Tensor, predicted: Tensor, weights: Tensor, velocity: float) -> Tensor:

@@ -56,9 +56,10 @@ class Trainer:
         self._tensorboard = tensorboard
         self._device = available_device(self.config.device)
         self._crops = Crops(sequences, checkpoint.standardization, self.config.frames, self._device)
-        weights = coefficient_weights(
-            torch.from_numpy(checkpoint.standardization.scale), self.config.metric_power
+        scale, spread = map(
+            torch.from_numpy, (checkpoint.standardization.scale, checkpoint.standardization.spread)
         )
+        weights = coefficient_weights(scale, spread, self.config.metric_power)
         self._diffusion: Diffusion = checkpoint.diffusion().to(self._device)
         self._network = build_network(checkpoint.config)
         self._network.load_state_dict(checkpoint.network)

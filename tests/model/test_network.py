@@ -97,7 +97,7 @@ def test_the_vertex_model_is_the_basis_form(parametrization: Parametrization) ->
 
     x_t = diffusion.add_noise(x0, t, noise @ basis.T)
     predicted = diffusion.x0(small(x_t, t, small.condition(audio, keep), style), x_t, t)
-    loss = objective(x0, predicted, coefficient_weights(scale, 2.0), velocity=10.0)
+    loss = objective(x0, predicted, coefficient_weights(scale, torch.ones_like(scale), 2.0), velocity=10.0)
 
     vertices_t = diffusion.add_noise(x0 @ basis, t, noise)
     skipped = vertices_t @ basis.T @ basis

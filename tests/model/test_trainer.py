@@ -177,6 +177,19 @@ def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
     assert len(logs[0]) == len(logs[1])
 
 
+@pytest.mark.parametrize("power", [0.5, 2.0])
+def test_a_coefficient_weighs_the_same_however_it_is_scaled(power: float) -> None:
+    sd, residual = torch.tensor([0.08, 0.007, 0.005]), torch.tensor([0.01, -0.002, 0.003])
+    losses = []
+    for spread in (torch.ones(3), torch.tensor([1.0, 0.47, 0.8])):
+        weights = coefficient_weights(sd / spread, spread, power)
+        assert torch.isclose((weights * spread**2).sum(), torch.tensor(1.0))  # predicting the mean
+        losses.append(float((weights * (residual / (sd / spread)) ** 2).sum()))
+    assert losses[1] == pytest.approx(losses[0], rel=1e-5)
+    still = coefficient_weights(sd, torch.tensor([1.0, 1.0, 0.0]), power)
+    assert torch.isfinite(still).all() and still[2] < 20 * still[0]
+
+
 @pytest.mark.parametrize("threads", [2, 3])
 def test_shares_of_a_batch_have_the_gradient_of_the_whole(threads: int) -> None:
     checkpoint, sequences = start()
@@ -184,10 +197,8 @@ def test_shares_of_a_batch_have_the_gradient_of_the_whole(threads: int) -> None:
     generator = torch.Generator().manual_seed(0)
     batch = Crops(sequences, checkpoint.standardization, 12).draw(7, generator)
     draws = Draws.of(batch, 500, config, generator)
-    scale = torch.from_numpy(checkpoint.standardization.scale)
-    objective = Objective(
-        checkpoint.model(), checkpoint.diffusion(), coefficient_weights(scale, 0.5), config
-    ).double()
+    weights = torch.linspace(0.1, 1, talker.K)
+    objective = Objective(checkpoint.model(), checkpoint.diffusion(), weights, config).double()
     objective.requires_grad_(True)
     batch = Batch(batch.motion.double(), batch.audio.double(), batch.style)
     draws = Draws(draws.t, draws.noise.double(), draws.keep.double(), draws.channels.double())
