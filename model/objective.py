@@ -152,12 +152,13 @@ class GraphedGradient:
 
     def __call__(self, batch: Batch, draws: Draws) -> Tensor:
         """As `SharedGradient`; every batch has the first one's size."""
-        if self._loss is None:
-            self._loss = self._record(batch, draws)
-        for tensor, value in zip(self._inputs, [*vars(batch).values(), *vars(draws).values()]):
-            tensor.copy_(value)
-        self._graph.replay()
-        return self._loss.clone()
+        with torch.cuda.device(batch.motion.device):
+            if self._loss is None:
+                self._loss = self._record(batch, draws)
+            for tensor, value in zip(self._inputs, [*vars(batch).values(), *vars(draws).values()]):
+                tensor.copy_(value)
+            self._graph.replay()
+            return self._loss.clone()
 
     def _record(self, batch: Batch, draws: Draws) -> Tensor:
         """The loss and the parameters' gradients as tensors that every replay fills anew."""
