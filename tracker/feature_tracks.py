@@ -53,7 +53,7 @@ def choose_frames(
     runs = [run[::step] for run in np.split(np.arange(len(good)), starts[1:]) if good[run].all()]
     windows = [run[i : i + WINDOW] for run in runs for i in range(0, len(run), WINDOW)]
     windows = [window for window in windows if len(window) >= MIN_LENGTH]
-    turn = [np.ptp(_turning(landmarks.points[window]), axis=0).max() for window in windows]
+    turn = [np.ptp(turning(landmarks.points[window]), axis=0).max() for window in windows]
     kept: list[int] = []
     for i in np.argsort(turn)[::-1]:
         if sum(len(windows[k]) for k in kept) + len(windows[i]) <= MAX_FRAMES:
@@ -69,7 +69,7 @@ def choose_frames(
     return frames, np.concatenate([[0], np.cumsum(apart)]).astype(np.int32)
 
 
-def _turning(points: F32) -> F32:
+def turning(points: NDArray[np.floating]) -> NDArray[np.floating]:
     """[n, 2] where the nose tip lies against the eyes, in eye distances: grows with the turn of the head."""
     right, left = points[:, RIGHT_EYE_OUTER, :2], points[:, LEFT_EYE_OUTER, :2]
     across = left - right

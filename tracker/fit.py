@@ -26,6 +26,7 @@ from tracker.energy import (
     visibility,
 )
 from tracker.gaze import eye_rotations
+from tracker.key_frames import key_frames
 from tracker.rigid_pose import hold_poses
 from tracker.solver import Smoothness, solve_frames, solve_subject
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track, TrackError
@@ -33,10 +34,8 @@ from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track, TrackError
 if TYPE_CHECKING:
     from tracker.head import HeadModel
 
-KEY_FRAMES = 48
 MIN_PRESENCE = 0.5
 LEAST_EVIDENCE = 0.02  # of a covered frame: enough to hold a pose where no neighbour does
-REST_SHARE = 0.5  # of the key frames: frames at rest, which tell the neutral face
 LIP_BIAS = 0.001  # m
 # Of its logarithm. At .08 the bundle's poses err by half as much as the landmarks'; at .24, or unknown, by more.
 SURE_FOCAL = 0.15
@@ -147,24 +146,6 @@ def _start(
         strictness=np.ones(len(seen)),
     )
     return energy, x
-
-
-def key_frames(observed: F64, px_per_m: F64) -> tuple[Frames, Frames]:
-    """Frames at rest (mouth closed, little motion) and frames spread over the clip, KEY_FRAMES at most.
-
-    observed: [n, 478, 2] px.
-    """
-    n = len(observed)
-    opening = np.linalg.norm(observed[:, 13] - observed[:, 14], axis=-1) / px_per_m
-    lips = (observed[:, [61, 291, 13, 14]] - observed[:, [1]]) / px_per_m[:, None, None]
-    speed = np.zeros(n)
-    speed[1:] = np.linalg.norm(np.diff(lips, axis=0), axis=-1).max(1)
-    count = min(n, KEY_FRAMES)
-    rest = np.sort(np.argsort(opening + speed, kind="stable")[: max(1, n // 5)])
-    rest = rest[np.unique(np.linspace(0, len(rest) - 1, max(1, int(count * REST_SHARE))).round().astype(int))]
-    other = np.setdiff1d(np.arange(n), rest)
-    spread = np.linspace(0, len(other) - 1, min(count - len(rest), len(other))).round().astype(int)
-    return rest, other[spread]
 
 
 def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
