@@ -201,7 +201,7 @@ class _Problem:
 
     def _residuals(self, state: _State) -> tuple[F64, F64, F64]:
         """Residuals [O, 2] px, points turned [O, 3] and seen from the camera [O, 3], m."""
-        turned = np.einsum("oij,oj->oi", state.rotation[self._row], self.points(state)[self._point])
+        turned = (state.rotation[self._row] @ self.points(state)[self._point][..., None])[..., 0]
         seen = turned + self.placed(state)[self._row]
         projected = np.exp(state.log_focal) * seen[:, :2] / seen[:, 2:] + self._principal
         return projected - self._seen, turned, seen
@@ -305,14 +305,14 @@ def _eliminated(
         part[rows] for part in (linear.residual, linear.pose, linear.point, linear.focal)
     )
     m, q, r = len(window.frames), len(window.points), modes.shape[2]
-    points = _summed(window.by_point, np.einsum("oki,okj->oij", point, point))
+    points = _summed(window.by_point, point.transpose(0, 2, 1) @ point)
     points_focal = _summed(window.by_point, np.einsum("oki,ok->oi", point, focal)).reshape(-1)
     points_slope = _summed(window.by_point, np.einsum("oki,ok->oi", point, residual))
     cells = np.zeros((m, 6, q, 3))
-    cells[window.frame, :, window.point] = np.einsum("oki,okj->oij", pose, point)
+    cells[window.frame, :, window.point] = pose.transpose(0, 2, 1) @ point
     cross = cells.reshape(6 * m, 3 * q)
     basis = modes.reshape(3 * q, r)
-    points_shape = np.einsum("qij,qjr->qir", points, modes).reshape(3 * q, r)
+    points_shape = (points @ modes).reshape(3 * q, r)
 
     normal = np.zeros((1 + r, 1 + r))
     normal[0, 0] = (focal**2).sum()
@@ -324,7 +324,7 @@ def _eliminated(
     poses_common = np.column_stack([poses_focal, cross @ basis])
     poses_slope = _summed(window.by_frame, np.einsum("oki,ok->oi", pose, residual)).reshape(-1)
     blocks = np.zeros((m, 6, m, 6))
-    own = _summed(window.by_frame, np.einsum("oki,okj->oij", pose, pose))
+    own = _summed(window.by_frame, pose.transpose(0, 2, 1) @ pose)
     blocks[np.arange(m), :, np.arange(m)] = own * (1 + damping * np.eye(6))
     poses = blocks.reshape(6 * m, 6 * m)
 

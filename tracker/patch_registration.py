@@ -52,7 +52,7 @@ class Templates:
 
     def information(self) -> F64:
         """[n, 2, 2] of the shift."""
-        return np.einsum("k,nki,nkj->nij", _WEIGHT, self.gradients, self.gradients)
+        return (self.gradients * _WEIGHT[:, None]).transpose(0, 2, 1) @ self.gradients
 
     def corners(self) -> NDArray[np.bool_]:
         """[n] whether a patch is told apart in every direction."""
@@ -87,14 +87,13 @@ def register(texture: F32, guess: F64, bend: F64, templates: Templates) -> tuple
     guess: [n, 2] px. bend: [n, 2, 2], how each patch is turned and stretched since it was cut.
     """
     places = guess.copy()
-    around = np.einsum("nij,kj->nki", bend, _GRID)
+    around = _GRID @ bend.transpose(0, 2, 1)
+    slopes = templates.gradients * _WEIGHT[:, None]
     inverse = np.linalg.inv(templates.information() + 1e-6 * np.eye(2))
     length = np.full(len(guess), np.inf)
     for _ in range(ITERATIONS):
         error = _levelled(_sampled(texture, places[:, None] + around))[0] - templates.values
-        step = -np.einsum(
-            "nij,nj->ni", inverse, np.einsum("k,nk,nki->ni", _WEIGHT, error, templates.gradients)
-        )
+        step = -np.einsum("nij,nj->ni", inverse, (error[:, None] @ slopes)[:, 0])
         length = np.linalg.norm(step, axis=1)
         step *= np.minimum(1, LONGEST_STEP / np.maximum(length, 1e-9))[:, None]
         places += np.einsum("nij,nj->ni", bend, step)
