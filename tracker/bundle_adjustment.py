@@ -1,6 +1,9 @@
-"""Rigid head poses by pycolmap: robust absolute pose per frame, then one bundle adjustment with a shared focal.
+"""Rigid head poses: robust absolute pose per frame, then one bundle adjustment with a shared focal and a shape prior.
 
-pycolmap puts pixel centres at halves; everything here takes and gives them at integers.
+The adjustment finds the most probable poses, points and focal length together: Levenberg-Marquardt, in which points
+and then poses are eliminated window by window. A point may lie off the surface (glasses) and a track may fail, so both
+count by Cauchy's loss. pycolmap, which gives the absolute poses, puts pixel centres at halves; everything here takes
+and gives them at integers.
 """
 
 from __future__ import annotations
@@ -10,12 +13,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
+from tracker.rigid_surface import SurfacePoints
 from tracker.track import F64
 
-LOSS_SCALE = 0.7  # px, Cauchy: corners on brows, or under a moving highlight, count ever less beyond it
-MAX_ITERATIONS = 40
+LOSS_SCALE = 2.0  # standard deviations of an observation
+OFF_SCALE, NO_OUTLIERS = 3.0, 1e3  # standard deviations of a point's departure from the surface
+LEAST_NOISE_PX = 0.1
+# Points are let go from the surface by so much (m), for so many iterations; then the noise is measured anew.
+ROUNDS = ((0.01, 3), (0.01, 3), (0.004, 3), (0.0, 3), (0.0, 12))
+CONVERGED = 1e-4  # of the cost
+MOST_DAMPING = 100.0
+LONGEST_STEP = 0.5  # of log(focal)
 SEED = 0
 
 pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # a rejected step is no news to a user
@@ -37,10 +48,13 @@ class RigidScene:
     observations: F64
     window: NDArray[np.int32]
 
+    def rows(self) -> NDArray[np.int64]:
+        """[O] place of each observation's frame among the frames."""
+        return np.searchsorted(self.frames, self.observations[:, 0].astype(int))
+
     def residuals(self, focal: float, principal: tuple[float, float]) -> F64:
         """[O, 2] px, projected minus observed."""
-        row = np.searchsorted(self.frames, self.observations[:, 0].astype(int))
-        point = self.points[self.observations[:, 1].astype(int)]
+        row, point = self.rows(), self.points[self.observations[:, 1].astype(int)]
         seen = np.einsum("oij,oj->oi", self.rotation[row], point) + self.translation[row]
         return focal * seen[:, :2] / seen[:, 2:] + principal - self.observations[:, 2:]
 
@@ -68,88 +82,258 @@ def absolute_pose(xy: F64, points: F64, camera: pycolmap.Camera, max_error: floa
 
 
 def adjust(
-    scene: RigidScene,
-    camera: pycolmap.Camera,
-    refine_focal: bool,
-    fixed: NDArray[np.bool_] | None = None,
+    scene: RigidScene, surface: SurfacePoints, principal: tuple[float, float], focal: float, sd_log: float
 ) -> tuple[RigidScene, float, float] | None:
-    """Bundle adjustment over poses, points and, if asked, the focal length; None where it fails.
+    """The most probable scene, its focal length px and the standard deviation of its logarithm; None if it fails.
 
-    fixed: [Q] bool, points that stay where they are.
-    Returns the adjusted scene, the focal px and the formal standard deviation of its logarithm, which counts every
-    observation as independent with an error of 1 px (0 when not refined).
+    scene: where to begin; its points are taken from the surface. focal: px, the middle of a log-normal prior of
+    standard deviation sd_log; 0 holds it.
     """
-    world = _reconstruction(scene, camera)
-    config = pycolmap.BundleAdjustmentConfig()
-    for frame in scene.frames:
-        config.add_image(int(frame) + 1)
-    held = np.zeros(len(scene.points), bool) if fixed is None else fixed
-    for point in np.flatnonzero(held):
-        config.add_constant_point(int(point) + 1)
-    # Each window is free to move and scale as a whole: one pose holds it, damping holds its scale.
-    row = np.searchsorted(scene.frames, scene.observations[:, 0].astype(int))
-    free = np.unique(scene.window[row[~held[scene.observations[:, 1].astype(int)]]])
-    for number in free:
-        first = int(np.argmax(scene.window == number))
-        config.set_constant_rig_from_world_pose(int(scene.frames[first]) + 1)
-    if not refine_focal:
-        config.set_constant_cam_intrinsics(1)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(_options(refine_focal), config, world)
-    try:
-        usable = adjuster.solve().is_solution_usable()
-    except (RuntimeError, ValueError):  # its own checks of a problem it cannot take
-        return None
-    focal = float(world.cameras[1].params[0])
-    if not usable or not 0 < focal < np.inf:
-        return None
-    formal = 0.0
-    if refine_focal:
-        covariance = pycolmap.estimate_ba_covariance(
-            pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL), world, adjuster
-        )
-        block = covariance and covariance.get_other_params_cov(world.cameras[1].params)
-        if block is None:
-            return None
-        formal = float(np.sqrt(block[0, 0])) / focal
-    poses = np.stack([world.images[int(frame) + 1].cam_from_world().matrix() for frame in scene.frames])
-    points = np.stack([world.points3D[i + 1].xyz for i in range(len(scene.points))])
-    adjusted = replace(scene, rotation=poses[..., :3], translation=poses[..., 3], points=points)
-    return adjusted, focal, formal
-
-
-def _options(refine_focal: bool) -> pycolmap.BundleAdjustmentOptions:
-    options = pycolmap.BundleAdjustmentOptions(
-        refine_focal_length=refine_focal,
-        refine_extra_params=False,
-        refine_sensor_from_rig=False,
-        print_summary=False,
+    problem = _Problem(scene, surface, np.array(principal, np.float64), focal, sd_log)
+    state = _State(
+        log_focal=float(np.log(focal)),
+        shape=np.zeros(surface.modes.shape[2]),
+        departure=np.zeros_like(surface.mean),
+        rotation=scene.rotation,
+        translation=scene.translation,
     )
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = LOSS_SCALE
-    options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
-    options.ceres.solver_options.function_tolerance = 1e-6
-    options.ceres.solver_options.num_threads = 1
-    return options
+    try:
+        for loose, iterations in ROUNDS:
+            problem.let_go(loose, state)
+            state = problem.descended(state, iterations)
+        sd_log = problem.focal_sd_log(state)
+    except np.linalg.LinAlgError:
+        return None
+    found = replace(
+        scene, rotation=state.rotation, translation=problem.placed(state), points=problem.points(state)
+    )
+    px = float(np.exp(state.log_focal))
+    whole = np.isfinite(px) and np.isfinite(found.translation).all() and np.isfinite(found.points).all()
+    return (found, px, sd_log) if whole else None
 
 
-def _reconstruction(scene: RigidScene, camera: pycolmap.Camera) -> pycolmap.Reconstruction:
-    """Images are numbered by frame + 1, points by point + 1: 0 is no number in pycolmap."""
-    world = pycolmap.Reconstruction()
-    world.add_camera_with_trivial_rig(camera)
-    tracks = [pycolmap.Track() for _ in scene.points]
-    order = np.argsort(scene.observations[:, 0], kind="stable")
-    rows = scene.observations[order]
-    begin = np.searchsorted(rows[:, 0], scene.frames)
-    end = np.searchsorted(rows[:, 0], scene.frames, side="right")
-    for i, frame in enumerate(scene.frames.tolist()):
-        mine = rows[begin[i] : end[i]]
-        image = pycolmap.Image(
-            name=str(frame), keypoints=mine[:, 2:] + 0.5, camera_id=camera.camera_id, image_id=frame + 1
+@dataclass(frozen=True)
+class _State:
+    """shape: [R] weights of the modes. departure: [Q, 3] m, of the points. translation: [M, 3] m, its depth that for
+    the prior's focal length: the two would otherwise hold each other (the head's size in the picture is well known).
+    """
+
+    log_focal: float
+    shape: F64
+    departure: F64
+    rotation: F64
+    translation: F64
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Frames [m] and points [q] of one window, its observations [o], and sums over a frame's or a point's."""
+
+    frames: NDArray[np.int64]
+    points: NDArray[np.int64]
+    observations: NDArray[np.int64]
+    frame: NDArray[np.int64]
+    point: NDArray[np.int64]
+    by_frame: csr_array
+    by_point: csr_array
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """Residuals [O, 2] and their derivatives by pose [O, 2, 6], point [O, 2, 3] and log(focal) [O, 2]; weighted."""
+
+    residual: F64
+    pose: F64
+    point: F64
+    focal: F64
+
+
+class _Problem:
+    """The negative logarithm of the probability, doubled, and how to go down it."""
+
+    def __init__(
+        self, scene: RigidScene, surface: SurfacePoints, principal: F64, focal: float, sd_log: float
+    ) -> None:
+        self._surface, self._principal, self._focal = surface, principal, focal
+        self._focal_precision = sd_log**-2 if sd_log else 0.0
+        self._free = slice(0 if sd_log else 1, None)  # of log(focal) and shape
+        self._row, self._point = scene.rows(), scene.observations[:, 1].astype(int)
+        self._seen = scene.observations[:, 2:]
+        length = np.bincount(self._point)
+        # The error of a track hardly changes from one frame to the next: tracks count, not observations.
+        self._repeats = float((length**2).sum() / length.sum())
+        self._windows = [_window(scene.window, self._row, self._point, n) for n in np.unique(scene.window)]
+
+    def let_go(self, loose: float, state: _State) -> None:
+        """Allow points to lie `loose` m from the surface at least, and measure the noise."""
+        # Let go, all points may lie off alike, and must not pass for outliers.
+        self._off_scale = NO_OUTLIERS if loose else OFF_SCALE
+        covariance = np.linalg.inv(self._surface.precision) + loose**2 * np.eye(3)
+        self._precision = np.linalg.inv(covariance)
+        self._noise = max(LEAST_NOISE_PX, 1.4826 * float(np.median(np.abs(self._residuals(state)[0]))))
+
+    def points(self, state: _State) -> F64:
+        """[Q, 3] m."""
+        return self._surface.mean + self._surface.modes @ state.shape + state.departure
+
+    def placed(self, state: _State) -> F64:
+        """[M, 3] m, translations for the state's focal length."""
+        return state.translation * (1, 1, np.exp(state.log_focal) / self._focal)
+
+    def descended(self, state: _State, iterations: int) -> _State:
+        """The state after so many steps, none of them up."""
+        damping, cost = 1e-4, self._cost(state)
+        for _ in range(iterations):
+            moved = self._step(state, damping)
+            while not (new := self._cost(moved)) <= cost and damping < MOST_DAMPING:
+                damping *= 10
+                moved = self._step(state, damping)
+            if not new <= cost:
+                break
+            gain, cost, state, damping = cost - new, new, moved, max(damping / 10, 1e-6)
+            if gain < CONVERGED * cost:
+                break
+        return state
+
+    def focal_sd_log(self, state: _State) -> float:
+        """Standard deviation of log(focal) here; 0 where it is held."""
+        return 0.0 if self._free.start else float(np.sqrt(np.linalg.inv(self._normal(state, 0.0)[0])[0, 0]))
+
+    def _residuals(self, state: _State) -> tuple[F64, F64, F64]:
+        """Residuals [O, 2] px, points turned [O, 3] and seen from the camera [O, 3], m."""
+        turned = (state.rotation[self._row] @ self.points(state)[self._point][..., None])[..., 0]
+        seen = turned + self.placed(state)[self._row]
+        projected = np.exp(state.log_focal) * seen[:, :2] / seen[:, 2:] + self._principal
+        return projected - self._seen, turned, seen
+
+    def _off(self, state: _State) -> F64:
+        """[Q] squared distance of the points from the surface, in standard deviations, of which an outlier has some."""
+        return (
+            np.einsum("qi,qij,qj->q", state.departure, self._precision, state.departure) / self._off_scale**2
         )
-        rotation = pycolmap.Rotation3d(Rotation.from_matrix(scene.rotation[i]).as_quat())
-        world.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, scene.translation[i]))
-        for place, point in enumerate(mine[:, 1].astype(int).tolist()):
-            tracks[point].add_element(frame + 1, place)
-    for point, track in zip(scene.points, tracks):
-        world.add_point3D(point, track)
-    return world
+
+    def _cost(self, state: _State) -> float:
+        residual, _, seen = self._residuals(state)
+        if not (seen[:, 2] > 0).all():
+            return np.inf
+        data = np.log1p((residual**2).sum(1) / (LOSS_SCALE * self._noise) ** 2).sum()
+        cost = LOSS_SCALE**2 / self._repeats * data + self._off_scale**2 * np.log1p(self._off(state)).sum()
+        away = state.log_focal - np.log(self._focal)
+        return float(cost + (state.shape**2).sum() + self._focal_precision * away**2)
+
+    def _linear(self, state: _State) -> _Linear:
+        residual, turned, seen = self._residuals(state)
+        focal, depth = np.exp(state.log_focal), seen[:, 2:]
+        loss = 1 + (residual**2).sum(1) / (LOSS_SCALE * self._noise) ** 2
+        weight = 1 / (np.sqrt(loss * self._repeats) * self._noise)
+        by_place = np.zeros((len(residual), 2, 3))
+        by_place[:, 0, 0] = by_place[:, 1, 1] = focal / depth[:, 0]
+        by_place[:, :, 2] = -focal * seen[:, :2] / depth**2
+        by_place *= weight[:, None, None]
+        moved = by_place * (1, 1, focal / self._focal)
+        along = moved[:, :, 2] * state.translation[self._row, 2:]
+        return _Linear(
+            residual=weight[:, None] * residual,
+            pose=np.concatenate([np.cross(turned[:, None], by_place), moved], axis=2),
+            point=by_place @ state.rotation[self._row],
+            focal=weight[:, None] * focal * seen[:, :2] / depth + along,
+        )
+
+    def _step(self, state: _State, damping: float) -> _State:
+        """One step of Levenberg-Marquardt."""
+        normal, slope, solved = self._normal(state, damping)
+        common = np.zeros(len(slope))
+        common[self._free] = -np.linalg.solve(normal[self._free, self._free], slope[self._free])
+        departure, rotation, translation = (
+            part.copy() for part in (state.departure, state.rotation, state.translation)
+        )
+        for window, (points, poses) in zip(self._windows, solved):
+            change = -(poses[:, -1] + poses[:, :-1] @ common)
+            turn = change.reshape(-1, 6)
+            departure[window.points] -= (points @ [*change, *common, 1.0]).reshape(-1, 3)
+            rotation[window.frames] = Rotation.from_rotvec(turn[:, :3]).as_matrix() @ rotation[window.frames]
+            translation[window.frames] += turn[:, 3:]
+        longer = float(np.clip(common[0], -LONGEST_STEP, LONGEST_STEP))
+        return _State(state.log_focal + longer, state.shape + common[1:], departure, rotation, translation)
+
+    def _normal(self, state: _State, damping: float) -> tuple[F64, F64, list[tuple[F64, F64]]]:
+        """Normal matrix and slope of log(focal) and shape, and for each window what gives its points and poses."""
+        linear, off = self._linear(state), 1 / (1 + self._off(state))
+        precision = off[:, None, None] * self._precision
+        pull = np.einsum("qij,qj->qi", precision, state.departure)
+        away = state.log_focal - np.log(self._focal)
+        normal = np.diag([self._focal_precision, *np.ones(len(state.shape))])
+        slope = np.concatenate([[self._focal_precision * away], state.shape])
+        solved = []
+        for window in self._windows:
+            mine = window.points
+            more, pushed, back = _eliminated(
+                linear, window, self._surface.modes[mine], precision[mine], pull[mine], damping
+            )
+            normal, slope = normal + more, slope + pushed
+            solved.append(back)
+        return normal, slope, solved
+
+
+def _window(
+    windows: NDArray[np.int32], row: NDArray[np.int64], point: NDArray[np.int64], number: int
+) -> _Window:
+    observations = np.flatnonzero(windows[row] == number)
+    frames = np.flatnonzero(windows == number)
+    points, k = np.unique(point[observations], return_inverse=True)
+    m = np.searchsorted(frames, row[observations])
+    ones, columns = np.ones(len(m)), np.arange(len(m))
+    by_frame = csr_array((ones, (m, columns)), shape=(len(frames), len(m)))
+    by_point = csr_array((ones, (k, columns)), shape=(len(points), len(m)))
+    return _Window(frames, points, observations, m, k, by_frame, by_point)
+
+
+def _summed(sums: csr_array, values: F64) -> F64:
+    return (sums @ values.reshape(len(values), -1)).reshape(sums.shape[0], *values.shape[1:])
+
+
+def _eliminated(
+    linear: _Linear, window: _Window, modes: F64, precision: F64, pull: F64, damping: float
+) -> tuple[F64, F64, tuple[F64, F64]]:
+    """Normal matrix [1 + R, 1 + R] and slope [1 + R] of log(focal) and shape, points and poses of a window solved for.
+
+    Then what gives these back: for points [3q, 6m + 1 + R + 1] by poses, focal and shape, and 1; for poses
+    [6m, 1 + R + 1] by focal and shape, and 1.
+    """
+    rows = window.observations
+    residual, pose, point, focal = (
+        part[rows] for part in (linear.residual, linear.pose, linear.point, linear.focal)
+    )
+    m, q, r = len(window.frames), len(window.points), modes.shape[2]
+    points = _summed(window.by_point, point.transpose(0, 2, 1) @ point)
+    points_focal = _summed(window.by_point, np.einsum("oki,ok->oi", point, focal)).reshape(-1)
+    points_slope = _summed(window.by_point, np.einsum("oki,ok->oi", point, residual))
+    cells = np.zeros((m, 6, q, 3))
+    cells[window.frame, :, window.point] = pose.transpose(0, 2, 1) @ point
+    cross = cells.reshape(6 * m, 3 * q)
+    basis = modes.reshape(3 * q, r)
+    points_shape = (points @ modes).reshape(3 * q, r)
+
+    normal = np.zeros((1 + r, 1 + r))
+    normal[0, 0] = (focal**2).sum()
+    normal[0, 1:] = normal[1:, 0] = points_focal @ basis
+    normal[1:, 1:] = basis.T @ points_shape
+    slope = np.concatenate([[(focal * residual).sum()], basis.T @ points_slope.reshape(-1)])
+    points_common = np.column_stack([points_focal, points_shape])
+    poses_focal = _summed(window.by_frame, np.einsum("oki,ok->oi", pose, focal)).reshape(-1)
+    poses_common = np.column_stack([poses_focal, cross @ basis])
+    poses_slope = _summed(window.by_frame, np.einsum("oki,ok->oi", pose, residual)).reshape(-1)
+    blocks = np.zeros((m, 6, m, 6))
+    own = _summed(window.by_frame, pose.transpose(0, 2, 1) @ pose)
+    blocks[np.arange(m), :, np.arange(m)] = own * (1 + damping * np.eye(6))
+    poses = blocks.reshape(6 * m, 6 * m)
+
+    right = np.column_stack([cross.T, points_common, (points_slope + pull).reshape(-1)])
+    gone = np.linalg.inv(points * (1 + damping) + precision)
+    back = (gone @ right.reshape(q, 3, -1)).reshape(3 * q, -1)
+    poses -= cross @ back[:, : 6 * m]
+    rest = np.column_stack([poses_common, poses_slope]) - cross @ back[:, 6 * m :]
+    kept = np.linalg.solve(poses, rest)
+    normal -= points_common.T @ back[:, 6 * m : -1] + rest[:, :-1].T @ kept[:, :-1]
+    slope -= points_common.T @ back[:, -1] + rest[:, :-1].T @ kept[:, -1]
+    return normal, slope, (back, kept)

@@ -1,8 +1,8 @@
 """The clip's camera: focal length from rigid feature tracks where they can tell it, else from a stated prior.
 
 The upper face is a rigid body that turns before a camera whose focal length never changes, so all shots of a
-clip are adjusted together with one focal. Its uncertainty comes from the adjustment's covariance and decides how
-much the prior still counts.
+clip are adjusted together with one focal, under priors on it and on the shape of heads. What uncertainty is then left
+decides whether the clip has told the focal length.
 """
 
 from __future__ import annotations
@@ -12,19 +12,20 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial.transform import Rotation
 
 from tracker.bundle_adjustment import RigidScene, absolute_pose, adjust, camera_model
 from tracker.feature_tracks import FeatureTracks, Frame, track_features
 from tracker.head import HeadModel, LandmarkEmbedding
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, STEADY_CORNERS, UPPER_FACE
+from tracker.rigid_surface import SurfacePoints, surface_points
 from tracker.track import F64, Bundle, Camera, Landmarks
 
 PRIOR_FOCAL = 1.3  # of the picture's long side: phones and webcams .7-1.2, camcorders and portraits 1.2-2.5
 PRIOR_SD_LOG = 0.35
 FOCAL_RANGE = (0.6, 5.0)  # of the long side
-SECOND_START = 1.6  # times the prior's: the adjustment must come to the same focal length from there
+LEAST_SD_LOG = 0.05  # of log(focal): what light and skin that moves do to all tracks alike
+TOLD = 0.8  # of the prior's uncertainty: a clip that leaves more of it has told nothing
 MIN_TURN_DEG = 8.0  # a head that turns less leaves focal length and depth undecided
 OUTLIER = (
     0.08  # of the distance between the outer eye corners: farther landmarks do not count for a frame's pose
@@ -32,9 +33,6 @@ OUTLIER = (
 FEW = 20  # landmarks of the upper face: a user's sparse embedding has less, and most of them on the nose's ridge
 MIN_OBSERVATIONS = 12  # of a frame in the bundle
 MIN_LENGTH = 3  # observations of a point in the bundle
-MAX_DEPARTURE = (
-    0.005  # m, median from the mean head: 3 mm is another identity, more the noise of a still head
-)
 
 
 def estimate_camera(
@@ -57,38 +55,24 @@ def estimate_camera(
     segments = np.zeros(total, np.int32) if segments is None else segments
     prior = _camera(landmarks.size, focal_given)
     tracks = track_features(frames(), landmarks, usable, segments, progress)
-    start = _start(tracks, landmarks, head, prior)
-    found = _adjust(start, prior, refine_focal=focal_given is None) if len(start.observations) else None
-    if found is None:
+    start, surface = _start(tracks, landmarks, head, prior)
+    if not len(start.observations):
         return prior, _bundle(start)
-    scene, focal, formal = found
-    camera = prior
-    told = _tells_depth(scene, start)
-    if focal_given is not None and not told:
-        return prior, _bundle(_nothing())
-    if focal_given is None and told:
-        sd_log = _focal_sd_log(scene, focal, formal, prior)
-        camera = _joined(prior, focal, float(np.hypot(sd_log, _start_dependence(start, prior, focal))))
-    # Windows that fall back on their first poses must fit the final focal length, not the prior's.
-    first = _scaled(start, camera.focal_px / prior.focal_px)
-    return camera, _bundle(_final(scene, first, focal, camera))
+    found = adjust(start, surface, prior.principal_px, prior.focal_px, prior.focal_sd_log)
+    camera = prior if found is None else _told(prior, *found)
+    if camera.method == "prior":  # the poses must fit its focal length
+        found = adjust(start, surface, prior.principal_px, prior.focal_px, 0.0)
+    return camera, _bundle(start if found is None else _settled(found[0], surface))
 
 
-def _adjust(scene: RigidScene, camera: Camera, refine_focal: bool) -> tuple[RigidScene, float, float] | None:
-    return adjust(scene, camera_model(camera.focal_px, camera.principal_px, camera.size), refine_focal)
-
-
-def _tells_depth(scene: RigidScene, start: RigidScene) -> bool:
-    """Whether the head turns and most points end up near the mean head; noise takes those of a still head away."""
-    _, loose = _settled(scene, start)
-    return _turn_deg(scene) >= MIN_TURN_DEG and bool(loose.mean() < 0.5)
-
-
-def _start_dependence(start: RigidScene, camera: Camera, focal: float) -> float:
-    """How far log(focal) moves when the adjustment begins from another focal length: nothing where it is known."""
-    there = replace(camera, focal_px=SECOND_START * camera.focal_px)
-    again = _adjust(_scaled(start, SECOND_START), there, refine_focal=True)
-    return abs(float(np.log(again[1] / focal))) if again is not None else np.inf
+def _told(prior: Camera, scene: RigidScene, focal: float, sd_log: float) -> Camera:
+    """The camera that the adjustment, in which the prior counts, found; the prior's where it learnt too little."""
+    low, high = (bound * max(prior.size) for bound in FOCAL_RANGE)
+    sd_log = float(np.hypot(sd_log, LEAST_SD_LOG))
+    still = _turn_deg(scene) < MIN_TURN_DEG
+    if prior.method == "given" or still or sd_log > TOLD * PRIOR_SD_LOG or not low <= focal <= high:
+        return prior
+    return replace(prior, focal_px=focal, focal_sd_log=sd_log, method="bundle")
 
 
 def _camera(size: tuple[int, int], focal_given: float | None) -> Camera:
@@ -110,31 +94,6 @@ def _camera(size: tuple[int, int], focal_given: float | None) -> Camera:
     )
 
 
-def _joined(prior: Camera, focal: float, sd_log: float) -> Camera:
-    """Prior and bundle joined in log space, or the prior alone where the bundle tells less than it."""
-    low, high = (bound * max(prior.size) for bound in FOCAL_RANGE)
-    if sd_log >= PRIOR_SD_LOG or not low <= focal <= high:
-        return prior
-    weight, prior_weight = sd_log**-2, PRIOR_SD_LOG**-2
-    log_focal = (weight * np.log(focal) + prior_weight * np.log(prior.focal_px)) / (weight + prior_weight)
-    return replace(
-        prior,
-        focal_px=float(np.clip(np.exp(log_focal), low, high)),
-        focal_sd_log=float((weight + prior_weight) ** -0.5),
-        method="bundle",
-    )
-
-
-def _focal_sd_log(scene: RigidScene, focal: float, formal: float, camera: Camera) -> float:
-    """Standard deviation of log(focal): the formal one, for errors as large and as dependent as they are.
-
-    The error of a track hardly changes from one frame to the next, so tracks count, not observations.
-    """
-    noise = 1.4826 * float(np.median(np.abs(scene.residuals(focal, camera.principal_px))))
-    length = np.bincount(scene.observations[:, 1].astype(int))
-    return formal * noise * float(np.sqrt((length**2).sum() / length.sum()))
-
-
 def _turn_deg(scene: RigidScene) -> float:
     """How far the direction from the head to the camera turns within a window, 5 % of the frames left out."""
     towards = -np.einsum("mji,mj->mi", scene.rotation, scene.translation)
@@ -147,8 +106,10 @@ def _turn_deg(scene: RigidScene) -> float:
     return float(np.degrees(max(turns)))
 
 
-def _start(tracks: FeatureTracks, landmarks: Landmarks, head: HeadModel, camera: Camera) -> RigidScene:
-    """Poses from the mean head's landmarks, and points where the tracks begin on its surface."""
+def _start(
+    tracks: FeatureTracks, landmarks: Landmarks, head: HeadModel, camera: Camera
+) -> tuple[RigidScene, SurfacePoints]:
+    """Poses from the mean head's landmarks, and points where the tracks run over its surface."""
     embedding = head.landmark_embedding
     rigid = rigid_landmarks(embedding)
     mean = np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis))
@@ -160,15 +121,17 @@ def _start(tracks: FeatureTracks, landmarks: Landmarks, head: HeadModel, camera:
     poses = [absolute_pose(seen, surface, model, float(error)) for seen, error in zip(xy, errors)]
     good = np.array([pose is not None for pose in poses], bool)
     known = [pose for pose in poses if pose is not None]
+    points = surface_points(tracks, xy, head, rigid)
     scene = RigidScene(
         frames=tracks.frames[good],
         rotation=np.array([rotation for rotation, _ in known]).reshape(-1, 3, 3),
         translation=np.array([translation for _, translation in known]).reshape(-1, 3),
-        points=_points(tracks, xy, surface),
+        points=points.mean,
         observations=tracks.observations.astype(np.float64),
         window=tracks.window[good],
     )
-    return _pruned(scene)
+    pruned, kept = _pruned(scene)
+    return pruned, points.select(kept)
 
 
 def rigid_landmarks(embedding: LandmarkEmbedding) -> NDArray[np.bool_]:
@@ -177,23 +140,11 @@ def rigid_landmarks(embedding: LandmarkEmbedding) -> NDArray[np.bool_]:
     return upper if upper.sum() > FEW else upper | np.isin(embedding.landmarks, STEADY_CORNERS)
 
 
-def _points(tracks: FeatureTracks, xy: F64, surface: F64) -> F64:
-    """[Q, 3] m, NaN off the surface: each track's first place on the mean head, between its landmarks.
+def _pruned(scene: RigidScene) -> tuple[RigidScene, NDArray[np.int64]]:
+    """Without frames and points that see, or are seen, too little, and which points these are.
 
-    xy: [M, L, 2] px and surface: [L, 3] m, the same landmarks in the picture and on the head.
+    With none left, the poses alone stay.
     """
-    numbers, first = np.unique(tracks.observations[:, 1].astype(int), return_index=True)
-    points = np.full((len(numbers), 3), np.nan)
-    begun = tracks.observations[first]
-    for row, frame in enumerate(tracks.frames):
-        mine = begun[:, 0] == frame
-        if mine.any():
-            points[mine] = LinearNDInterpolator(xy[row], surface)(begun[mine, 2:])
-    return points
-
-
-def _pruned(scene: RigidScene) -> RigidScene:
-    """Without frames and points that see, or are seen, too little; with none left, the poses alone stay."""
     rows = scene.observations[np.isfinite(scene.points[scene.observations[:, 1].astype(int)]).all(1)]
     rows = rows[np.isin(rows[:, 0], scene.frames)]
     while len(rows):
@@ -203,10 +154,11 @@ def _pruned(scene: RigidScene) -> RigidScene:
             break
         rows = rows[keep]
     if not len(rows):
-        return replace(scene, points=np.zeros((0, 3)), observations=np.zeros((0, 4)))
+        nothing = replace(scene, points=np.zeros((0, 3)), observations=np.zeros((0, 4)))
+        return nothing, np.zeros(0, np.int64)
     seen = np.isin(scene.frames, rows[:, 0])
     kept, number = np.unique(rows[:, 1].astype(int), return_inverse=True)
-    return replace(
+    left = replace(
         scene,
         frames=scene.frames[seen],
         rotation=scene.rotation[seen],
@@ -215,53 +167,19 @@ def _pruned(scene: RigidScene) -> RigidScene:
         points=scene.points[kept],
         observations=np.column_stack([rows[:, 0], number, rows[:, 2:]]),
     )
+    return left, kept
 
 
-def _nothing() -> RigidScene:
-    frames, no_points = np.zeros(0, np.int32), np.zeros((0, 3))
-    return RigidScene(frames, np.zeros((0, 3, 3)), no_points, no_points, np.zeros((0, 4)), frames)
-
-
-def _scaled(scene: RigidScene, factor: float) -> RigidScene:
-    """The scene for a focal longer by `factor`: as far again from the camera."""
-    return replace(scene, translation=scene.translation * (1, 1, factor))
-
-
-def _final(scene: RigidScene, start: RigidScene, focal: float, camera: Camera) -> RigidScene:
-    """The scene, adjusted with a free focal, once more under the final camera and in the mean head's frame.
-
-    Where a window's head is too still to tell its shape, the points stay on the mean head.
-    """
-    settled, loose = _settled(_scaled(scene, camera.focal_px / focal), start)
-    model = camera_model(camera.focal_px, camera.principal_px, camera.size)
-    found = adjust(settled, model, refine_focal=False, fixed=loose)
-    return _settled(found[0], start)[0] if found is not None else settled
-
-
-def _settled(scene: RigidScene, start: RigidScene) -> tuple[RigidScene, NDArray[np.bool_]]:
-    """Each window moved, turned and scaled as a whole onto its points as they began, on the mean head.
-
-    A window whose points then lie far from where they began gets these back, with its first poses; [Q] says
-    which points these are.
-    """
-    rotation, translation, points = scene.rotation.copy(), scene.translation.copy(), scene.points.copy()
-    row = np.searchsorted(scene.frames, scene.observations[:, 0].astype(int))
-    window_of = np.zeros(len(points), np.int64)
-    window_of[scene.observations[:, 1].astype(int)] = scene.window[row]
-    loose = np.zeros(len(points), bool)
-    for number in np.unique(scene.window):
-        mine, poses = window_of == number, scene.window == number
-        turn, scale, shift = _similarity(scene.points[mine], start.points[mine])
-        moved = scale * scene.points[mine] @ turn.T + shift
-        if np.median(np.linalg.norm(moved - start.points[mine], axis=1)) > MAX_DEPARTURE:
-            loose |= mine
-            points[mine] = start.points[mine]
-            rotation[poses], translation[poses] = start.rotation[poses], start.translation[poses]
-            continue
-        points[mine] = moved
-        rotation[poses] = scene.rotation[poses] @ turn.T
-        translation[poses] = scale * scene.translation[poses] - rotation[poses] @ shift
-    return replace(scene, rotation=rotation, translation=translation, points=points), loose
+def _settled(scene: RigidScene, surface: SurfacePoints) -> RigidScene:
+    """The whole moved, turned and scaled onto the mean head, where its shape leaves it loose."""
+    turn, scale, shift = _similarity(scene.points, surface.mean)
+    rotation = scene.rotation @ turn.T
+    return replace(
+        scene,
+        points=scale * scene.points @ turn.T + shift,
+        rotation=rotation,
+        translation=scale * scene.translation - rotation @ shift,
+    )
 
 
 def _bundle(scene: RigidScene) -> Bundle:

@@ -1,4 +1,4 @@
-"""Feature tracks on the rigid upper face: corners followed from frame to frame, never from one shot to another."""
+"""Feature tracks on the rigid upper face: patches found again within a window, never from one shot in another."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracker.landmark_indices import LEFT_EYE, LEFT_EYE_OUTER, RIGHT_EYE, RIGHT_EYE_OUTER, UPPER_FACE
-from tracker.track import F32, Landmarks
+from tracker.patch_registration import NO_TEMPLATES, cut_templates, fine_texture, register
+from tracker.track import F32, F64, Landmarks
 
 SPACING_S = 0.12  # between the frames that are followed: about every third at 25 fps
 WINDOW = 25  # followed frames, 3 s: the unit in which a long clip is thinned
+LONGEST = 75  # followed frames, after which tracks begin anew: what is adjusted at once
 MAX_FRAMES = 400
 MIN_PRESENCE = 0.5
 CORNERS = 250
@@ -21,7 +23,8 @@ REPLENISH = 5  # followed frames between searches for new corners
 EYE_DISTANCE = (
     120.0  # px between the outer eye corners, at most: a larger face is followed in a smaller picture
 )
-FORWARD_BACKWARD = 0.3  # px, a track that does not come back to within it ends
+REACH = 0.35  # eye distances, of the landmarks that carry a patch along
+MIN_SHRINK = 0.3  # of its area: a patch seen more aslant is not looked for
 MIN_LENGTH = 5  # observations of a track that is kept
 
 Frame = tuple[float, NDArray[np.uint8]]
@@ -64,9 +67,10 @@ def choose_frames(
     chosen = [windows[i] for i in sorted(kept)]
     frames = np.concatenate(chosen).astype(np.int32)
     # Neighbours in one shot are one window: tracks live on.
-    gap = np.diff(frames) != step
-    apart = gap | (np.diff(segments[frames]) != 0)
-    return frames, np.concatenate([[0], np.cumsum(apart)]).astype(np.int32)
+    apart = (np.diff(frames) != step) | (np.diff(segments[frames]) != 0)
+    joined = np.concatenate([[0], np.cumsum(apart)])
+    age = np.arange(len(frames)) - np.searchsorted(joined, joined)
+    return frames, np.unique(joined * len(frames) + age // LONGEST, return_inverse=True)[1].astype(np.int32)
 
 
 def turning(points: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -122,7 +126,11 @@ def _long_tracks(observations: NDArray[np.float64]) -> F32:
 
 
 class _Follower:
-    """Corners and where they are, in a picture scaled by `scale`."""
+    """Patches and where they were last, in a picture scaled by `scale`.
+
+    A patch is looked for in each picture as it was first seen, bent as the landmarks around it moved: its error does
+    not grow with time, and it is found again after it was hidden.
+    """
 
     def __init__(self, scale: float) -> None:
         self._scale = scale
@@ -130,71 +138,91 @@ class _Follower:
         self.reset()
 
     def reset(self) -> None:
-        """Drops all tracks."""
-        self._gray: NDArray[np.uint8] | None = None
-        self._face = np.zeros((0, 2), np.float32)
-        self._xy = np.zeros((0, 2), np.float32)
+        """Drops all patches."""
+        self._templates = NO_TEMPLATES
         self._numbers = np.zeros(0, np.int64)
+        self._begun = np.zeros((0, 2))  # px, where each was first seen
+        self._face = np.zeros((0, len(UPPER_FACE), 2))  # px, the landmarks there
+        self._offset = np.zeros((0, 2))  # px, from where the landmarks put it to where it was last
         self._age = 0
 
     def next(self, rgb: NDArray[np.uint8], points: F32) -> tuple[NDArray[np.int64], F32]:
-        """Numbers [n] and places [n, 2] px of the corners seen in this picture; points: landmarks [478, 2] px."""
+        """Numbers [n] and places [n, 2] px of the patches seen in this picture; points: landmarks [478, 2] px."""
         gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         if self._scale < 1:
             gray = cv2.resize(gray, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA)
         scale = np.array(gray.shape[::-1]) / np.array(rgb.shape[1::-1])
         face = ((points + 0.5) * scale - 0.5).astype(np.float32)
-        region = upper_face_mask(face, gray.shape)
-        if self._gray is not None and len(self._xy):
-            self._follow(gray, face, region)
+        region, texture = upper_face_mask(face, gray.shape), fine_texture(gray)
+        rows, xy = self._found(texture, face, region)
+        numbers = self._numbers[rows]
         if self._age % REPLENISH == 0:
-            self._replenish(gray, region, face)
-        self._gray, self._face, self._age = gray, face, self._age + 1
-        return self._numbers.copy(), ((self._xy + 0.5) / scale - 0.5).astype(np.float32)
+            more, places = self._replenished(texture, face, region, xy)
+            numbers, xy = np.concatenate([numbers, more]), np.concatenate([xy, places])
+        self._age += 1
+        return numbers, ((xy + 0.5) / scale - 0.5).astype(np.float32)
 
-    def _follow(self, gray: NDArray[np.uint8], face: F32, region: NDArray[np.uint8]) -> None:
-        rigid = list(UPPER_FACE)
-        motion, _ = cv2.estimateAffinePartial2D(self._face[rigid], face[rigid])
-        guess = self._xy if motion is None else self._xy @ motion[:, :2].T + motion[:, 2]
-        forward, found = _flow(self._gray, gray, self._xy, guess)
-        back, returned = _flow(gray, self._gray, forward, self._xy)
-        x, y = np.clip(forward.round().astype(int), 0, np.array(gray.shape[::-1]) - 1).T
-        error = np.linalg.norm(back - self._xy, axis=1)
-        keep = found & returned & (error < FORWARD_BACKWARD) & (region[y, x] > 0)
-        self._xy, self._numbers = forward[keep], self._numbers[keep]
+    def _found(self, texture: F32, face: F32, region: NDArray[np.uint8]) -> tuple[NDArray[np.int64], F64]:
+        """Rows [n] of the patches seen again, and where [n, 2] px."""
+        if not len(self._numbers):
+            return np.zeros(0, np.int64), np.zeros((0, 2))
+        reach = REACH * float(np.linalg.norm(face[LEFT_EYE_OUTER] - face[RIGHT_EYE_OUTER]))
+        expected, bend = _carried(self._begun, self._face, face[list(UPPER_FACE)].astype(np.float64), reach)
+        guess = expected + self._offset
+        rows = np.flatnonzero(_inside(region, guess) & (np.linalg.det(bend) > MIN_SHRINK))
+        xy, found = register(texture, guess[rows], bend[rows], self._templates.select(rows))
+        found &= _inside(region, xy)
+        rows, xy = rows[found], xy[found]
+        self._offset[rows] = xy - expected[rows]
+        return rows, xy
 
-    def _replenish(self, gray: NDArray[np.uint8], region: NDArray[np.uint8], face: F32) -> None:
-        wanted = CORNERS - len(self._xy)
-        if wanted <= 0:
-            return
+    def _replenished(
+        self, texture: F32, face: F32, region: NDArray[np.uint8], seen: F64
+    ) -> tuple[NDArray[np.int64], F64]:
+        """Numbers [n] and places [n, 2] px of new patches where none of those seen [k, 2] px is."""
+        wanted = CORNERS - len(seen)
         # Evenly over the region: as many corners as fit at this distance.
         apart = max(2.0, 0.7 * np.sqrt(np.count_nonzero(region) / CORNERS))
         free = region.copy()
-        for x, y in self._xy.round().astype(int):
+        for x, y in seen.round().astype(int):
             cv2.circle(free, (int(x), int(y)), round(apart), 0, -1)
-        corners = cv2.goodFeaturesToTrack(gray, wanted, 0.002, apart, mask=free, blockSize=5)
+        corners = None
+        if wanted > 0:
+            corners = cv2.goodFeaturesToTrack(texture, wanted, 0.002, apart, mask=free, blockSize=5)
         if corners is None:
-            return
-        new = corners.reshape(-1, 2).astype(np.float32)
-        self._xy = np.concatenate([self._xy, new])
-        self._numbers = np.concatenate([self._numbers, self._next_number + np.arange(len(new))])
-        self._next_number += len(new)
+            return np.zeros(0, np.int64), np.zeros((0, 2))
+        places = corners.reshape(-1, 2).astype(np.float64)
+        templates = cut_templates(texture, places)
+        sound = templates.corners()
+        places, count = places[sound], int(sound.sum())
+        numbers = self._next_number + np.arange(count)
+        self._next_number += count
+        self._templates = self._templates.joined(templates.select(sound))
+        self._numbers = np.concatenate([self._numbers, numbers])
+        self._begun = np.concatenate([self._begun, places])
+        landmarks = np.broadcast_to(face[list(UPPER_FACE)], (count, len(UPPER_FACE), 2))
+        self._face = np.concatenate([self._face, landmarks])
+        self._offset = np.concatenate([self._offset, np.zeros((count, 2))])
+        return numbers, places
 
 
-def _flow(
-    old: NDArray[np.uint8] | None, new: NDArray[np.uint8] | None, xy: F32, guess: F32
-) -> tuple[F32, NDArray[np.bool_]]:
-    """Places [n, 2] px in `new` of the points xy of `old`, and whether each was found [n]."""
-    places, status, _ = cv2.calcOpticalFlowPyrLK(
-        old,
-        new,
-        np.ascontiguousarray(xy, np.float32),
-        np.ascontiguousarray(guess, np.float32).copy(),
-        winSize=(15, 15),
-        maxLevel=2,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )
-    return places, status[:, 0] > 0
+def _carried(xy: F64, before: F64, now: F64, reach: float) -> tuple[F64, F64]:
+    """Where the landmarks around them carry points xy [n, 2] px, and the affine motion there [n, 2, 2].
+
+    before: [n, L, 2] px, the landmarks when each point was at xy. now: [L, 2] px. reach: px, of a landmark's weight.
+    """
+    weight = np.exp(-((before - xy[:, None]) ** 2).sum(-1) / (2 * reach**2)) + 1e-6
+    weight /= weight.sum(1, keepdims=True)
+    centre, goal = np.einsum("nl,nli->ni", weight, before), weight @ now
+    old, new = before - centre[:, None], now - goal[:, None]
+    spread = np.einsum("nl,nli,nlj->nij", weight, old, old)
+    bend = np.einsum("nl,nli,nlj->nij", weight, new, old) @ np.linalg.inv(spread)
+    return goal + np.einsum("nij,nj->ni", bend, xy - centre), bend
+
+
+def _inside(region: NDArray[np.uint8], xy: F64) -> NDArray[np.bool_]:
+    x, y = np.clip(np.nan_to_num(xy).round().astype(int), 0, np.array(region.shape[::-1]) - 1).T
+    return region[y, x] > 0
 
 
 def upper_face_mask(points: F32, shape: tuple[int, ...]) -> NDArray[np.uint8]:

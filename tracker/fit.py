@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 MIN_PRESENCE = 0.5
 LEAST_EVIDENCE = 0.02  # of a covered frame: enough to hold a pose where no neighbour does
 LIP_BIAS = 0.001  # m
-# Of its logarithm. At .08 the bundle's poses err by half as much as the landmarks'; at .24, or unknown, by more.
-SURE_FOCAL = 0.15
 
 Frames = NDArray[np.int64]
 
@@ -56,7 +54,7 @@ def fit_track(
 ) -> Track:
     """The head's identity, and expression, pose and gaze in every frame, under the given camera.
 
-    bundle: its poses take the place of the landmarks' own where it tells the focal length well (SURE_FOCAL).
+    bundle: its poses take the place of the landmarks' own unless the focal length is the prior's.
     usable: [T] bool, frames that may be measured. segment: [T], number of the uninterrupted shot;
     smoothness never crosses from one to another.
     evidence: [T] 0..1, how far each frame's landmarks are followed, less where something covers the face: below one
@@ -76,7 +74,7 @@ def fit_track(
     followed = replace(energy, visible=energy.visible * share[:, None])
     smoothness = smoothness_between(energy, landmarks.time, good, segment)
     x, _ = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
-    if camera.method == "bundle" and camera.focal_sd_log <= SURE_FOCAL:
+    if camera.method != "prior":
         x = hold_poses(x, bundle, good, _runs(good, segment))
     return make_track(landmarks, camera, head, energy, observed, identity, x, good)
 
