@@ -139,8 +139,8 @@ class SharedGradient:
 
 
 class GraphedGradient:
-    """The gradient of an objective on a CUDA device, recorded once and replayed: a step is hundreds of kernels too small
-    to be worth starting one by one.
+    """The gradient of an objective on a CUDA device, recorded once and replayed: a step is hundreds of kernels, too
+    small to be worth starting one by one.
     """
 
     def __init__(self, objective: Objective) -> None:

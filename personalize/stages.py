@@ -89,7 +89,7 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 2, ("focal_px",)
+    name, version, reads = "camera", 3, ("focal_px",)
     needs = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz")
     makes = ("camera.json", "bundle.npz")
 
@@ -114,7 +114,7 @@ class CameraStage(Stage):
 class TrackStage(Stage):
     """One identity, and expression, pose and gaze in every frame, jointly over the clip."""
 
-    name, version = "track", 2
+    name, version = "track", 3
     needs = (
         *("ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz"),

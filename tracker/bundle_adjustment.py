@@ -314,11 +314,11 @@ def _eliminated(
     basis = modes.reshape(3 * q, r)
     points_shape = (points @ modes).reshape(3 * q, r)
 
-    normal = np.zeros((1 + r, 1 + r))
+    normal: F64 = np.zeros((1 + r, 1 + r))
     normal[0, 0] = (focal**2).sum()
     normal[0, 1:] = normal[1:, 0] = points_focal @ basis
     normal[1:, 1:] = basis.T @ points_shape
-    slope = np.concatenate([[(focal * residual).sum()], basis.T @ points_slope.reshape(-1)])
+    slope: F64 = np.concatenate([[(focal * residual).sum()], basis.T @ points_slope.reshape(-1)])
     points_common = np.column_stack([points_focal, points_shape])
     poses_focal = _summed(window.by_frame, np.einsum("oki,ok->oi", pose, focal)).reshape(-1)
     poses_common = np.column_stack([poses_focal, cross @ basis])
@@ -330,10 +330,10 @@ def _eliminated(
 
     right = np.column_stack([cross.T, points_common, (points_slope + pull).reshape(-1)])
     gone = np.linalg.inv(points * (1 + damping) + precision)
-    back = (gone @ right.reshape(q, 3, -1)).reshape(3 * q, -1)
+    back: F64 = (gone @ right.reshape(q, 3, -1)).reshape(3 * q, -1)
     poses -= cross @ back[:, : 6 * m]
     rest = np.column_stack([poses_common, poses_slope]) - cross @ back[:, 6 * m :]
-    kept = np.linalg.solve(poses, rest)
+    kept: F64 = np.linalg.solve(poses, rest)
     normal -= points_common.T @ back[:, 6 * m : -1] + rest[:, :-1].T @ kept[:, :-1]
     slope -= points_common.T @ back[:, -1] + rest[:, :-1].T @ kept[:, -1]
     return normal, slope, (back, kept)

@@ -27,9 +27,8 @@ FOCAL_RANGE = (0.6, 5.0)  # of the long side
 LEAST_SD_LOG = 0.05  # of log(focal): what light and skin that moves do to all tracks alike
 TOLD = 0.8  # of the prior's uncertainty: a clip that leaves more of it has told nothing
 MIN_TURN_DEG = 8.0  # a head that turns less leaves focal length and depth undecided
-OUTLIER = (
-    0.08  # of the distance between the outer eye corners: farther landmarks do not count for a frame's pose
-)
+# Of the distance between the outer eye corners: farther landmarks do not count for a frame's pose.
+OUTLIER = 0.08
 FEW = 20  # landmarks of the upper face: a user's sparse embedding has less, and most of them on the nose's ridge
 MIN_OBSERVATIONS = 12  # of a frame in the bundle
 MIN_LENGTH = 3  # observations of a point in the bundle

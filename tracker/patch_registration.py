@@ -16,11 +16,8 @@ from numpy.typing import NDArray
 from tracker.track import F32, F64
 
 HALF = 9  # px, of the side of a patch
-FINE_PX, COARSE_PX, STRENGTH_PX = (
-    0.8,
-    3.0,
-    6.0,
-)  # blurs between which the texture lies, and over which it is levelled
+FINE_PX, COARSE_PX = 0.8, 3.0  # blurs between which the texture lies
+STRENGTH_PX = 6.0  # blur over which it is levelled
 NOISE = 1.0  # grey levels: weaker texture is not raised to the strength of the rest
 ITERATIONS = 10
 LONGEST_STEP, SETTLED = 1.0, 0.02  # px

@@ -16,10 +16,8 @@ from tracker.feature_tracks import FeatureTracks
 from tracker.head import HeadModel
 from tracker.track import F64
 
-BEND_M, BEND_LENGTH_M = (
-    0.003,
-    0.04,
-)  # heads beyond the basis, and landmarks that lie elsewhere on another head
+# Heads beyond the basis, and landmarks that lie elsewhere on another head.
+BEND_M, BEND_LENGTH_M = 0.003, 0.04
 OFF_SURFACE_M = 0.001  # of a point from its smooth surface
 ALONG_SURFACE_M = 0.004  # of a point on it: landmarks slide when the head turns
 KEPT = 0.999  # of the variance
