@@ -17,7 +17,7 @@ from tracker.view import U8, Index
 if TYPE_CHECKING:
     from tracker.head import HeadModel
 
-KEYS = 64  # frames, spread over the clip, that tell the albedo
+KEYS = 48  # frames, spread over the clip, that tell the albedo
 STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
 # Times the usual deviation of the skin or of the mouth's: well-fitted laughs and turns reach 2.8.
 TOLERATED = 3.0
