@@ -34,7 +34,9 @@ class FrameReader(Iterator[tuple[float, U8]]):
         self._max_side = max_side
         self.info = probe(self._path)
         self.damaged = False
-        self._reformatter = VideoReformatter()  # one for all pictures: making its tables takes longer than its work
+        self._reformatter = (
+            VideoReformatter()
+        )  # one for all pictures: making its tables takes longer than its work
         self._pictures = self._read()
 
     def __next__(self) -> tuple[float, U8]:
@@ -80,7 +82,6 @@ class FrameReader(Iterator[tuple[float, U8]]):
         )
         array: U8 = rgb.to_ndarray()
         return array
-
 
 
 def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:

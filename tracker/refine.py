@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 KEYS = 48  # frames, spread over the clip, that tell the albedo
 STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
+HELD_BYTES = 256 << 20  # of cut-out faces, about 100 s of them; a longer clip is read twice instead
 # Times the usual deviation of the skin or of the mouth's: well-fitted laughs and turns reach 2.8.
 TOLERATED = 3.0
 Frame = tuple[float, U8]
@@ -49,8 +50,8 @@ def refine_track(
     """Expression, pose and gaze of the valid frames again, with the pictures; identity and camera stay.
 
     segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
-    each row of the landmarks; it is called twice. A frame whose skin does not come nearer to what it should look
-    like keeps its landmark fit, and so does one whose picture is missing. evidence: see `fit_track`.
+    each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
+    look like keeps its landmark fit, and so does one whose picture is missing. evidence: see `fit_track`.
     What it gains is printed by `python -m benchmarks tracking`: pose and jitter mostly; the lips' openings are left
     to the landmarks, see `Photometry.pair_noise_mm`.
     """
@@ -60,18 +61,17 @@ def refine_track(
     if not len(good):
         return Refined(track, unknown)
     subject = Subject.of(head, track.identity, energy, photometry)
-    wanted = np.unique(np.linspace(0, len(good) - 1, KEYS).round().astype(int))
-    keys = dict(_cuts(subject, camera, frames(), good[wanted], wanted))
+    keys, cuts = _looked_at(subject, camera, frames, good)
     if not keys:
         return Refined(track, unknown)
     rows = np.array(list(keys))
     levels = learn_levels(subject, list(keys.values()), rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
     refined = x.copy()
-    for start, cuts in _stretches(_cuts(subject, camera, frames(), good, np.arange(len(good))), len(good)):
-        rows = np.array(list(cuts))
+    for start, part in _stretches(cuts, len(good)):
+        rows = np.array(list(part))
         smoothness = smoothness_between(energy, landmarks.time, good[rows], segment, photometry.smoothness)
-        found, before, after = fit_stretch(subject, levels, list(cuts.values()), rows, x[rows], smoothness)
+        found, before, after = fit_stretch(subject, levels, list(part.values()), rows, x[rows], smoothness)
         better = np.isfinite(found).all(1) & (after[:, 0] < before[:, 0])
         own = (rows >= start) & (rows < start + STRETCH)
         refined[rows[own & better]] = found[own & better]
@@ -82,6 +82,18 @@ def refine_track(
         landmarks, camera, head, energy, observed, track.identity.astype(np.float64), refined, good
     )
     return _judged(out, deviation, good, unknown)
+
+
+def _looked_at(
+    subject: Subject, camera: Camera, frames: Callable[[], Iterable[Frame]], good: Index
+) -> tuple[dict[int, U8], Iterable[tuple[int, U8]]]:
+    """Rows and cut-out faces of the key frames, and of all frames `good`; a short clip's pictures are read once."""
+    keys, rows = np.unique(np.linspace(0, len(good) - 1, KEYS).round().astype(int)), np.arange(len(good))
+    if len(good) * subject.window.size[0] * subject.window.size[1] > HELD_BYTES:
+        chosen = dict(_cuts(subject, camera, frames(), good[keys], keys))
+        return chosen, _cuts(subject, camera, frames(), good, rows)
+    held = dict(_cuts(subject, camera, frames(), good, rows))
+    return {row: held[row] for row in keys.tolist() if row in held}, held.items()
 
 
 def _cuts(

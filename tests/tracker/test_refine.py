@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tracker import refine
 from tracker.fit import fit_track, make_track, resume
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
@@ -172,3 +173,11 @@ def test_stretches_cover_every_frame_once(total: int):
         assert min(held) == max(0, start - 8) and max(held) == min(total, start + 128) - 1
         covered += [row for row in held if start <= row < start + 120]
     assert covered == list(range(total))
+
+
+def test_a_long_clip_is_read_twice_to_the_same_end(film: Film, monkeypatch: pytest.MonkeyPatch):
+    once = film.refine()
+    monkeypatch.setattr(refine, "HELD_BYTES", 0)
+    twice = film.refine()
+    np.testing.assert_array_equal(twice.track.expression, once.track.expression)
+    np.testing.assert_array_equal(twice.photometric, once.photometric)
