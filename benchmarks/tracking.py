@@ -39,8 +39,9 @@ from benchmarks.in_model import noisy_landmarks
 from benchmarks.rendered_heads import SCENES
 from benchmarks.track_bars import Row, print_bars
 from benchmarks.track_errors import compare
+from personalize.container import probe
 from personalize.ingest import find_usable
-from personalize.media import probe, read_frames
+from personalize.pictures import read_frames
 from tracker.camera import estimate_camera
 from tracker.confidence import bare, judge
 from tracker.fit import fit_track

@@ -80,8 +80,7 @@ class FrameReader(Iterator[tuple[float, U8]]):
             interpolation="AREA" if frame.width > size[0] else "BICUBIC",
             src_colorspace=_BT709 if hd else None,
         )
-        array: U8 = rgb.to_ndarray()
-        return array
+        return np.asarray(rgb.to_ndarray(), np.uint8)
 
 
 def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:

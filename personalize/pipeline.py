@@ -6,9 +6,9 @@ from pathlib import Path
 
 from model.errors import ModelError
 from model.training_config import available_device
+from personalize.container import probe
 from personalize.errors import UserError
 from personalize.heads import run_head
-from personalize.media import probe
 from personalize.overlay import check_modes
 from personalize.reporter import Reporter
 from personalize.run import RunFolder

@@ -16,11 +16,12 @@ from personalize.files import sha256_file, sha256_json, write_json
 from personalize.finetune import finetune_run
 from personalize.heads import head_assets, run_head
 from personalize.ingest import ingest_video
-from personalize.media import read_frames, write_wav
 from personalize.overlay import write_overlay
+from personalize.pictures import read_frames
 from personalize.quality import frame_reasons, write_quality
 from personalize.registration import register_run
 from personalize.settings import Settings
+from personalize.sound import write_wav
 from personalize.stage import VIDEO, Context, Stage
 from personalize.subject_data import base_path
 from personalize.tracked import read_track_of
