@@ -50,7 +50,7 @@ from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.landmarker import track_landmarks
 from tracker.occlusion import Appearance, FaceWatch
 from tracker.refine import refine_track
-from tracker.track import Bundle, Camera, Landmarks, Track
+from tracker.track import F32, Bundle, Camera, Landmarks, Track
 
 PERSONS, PERSON_FRAMES = 3, 500
 COLUMNS = {
@@ -107,12 +107,12 @@ def stages(clip: Clip, head: HeadModel) -> Iterator[tuple[str, Track, float]]:
             *(track, landmarks, camera, head, clip.segment, lambda: read_frames(video)), evidence=evidence
         )
         spent += 1e3 * (time.process_time() - start) / count
-        yield "refined", judged(refined.track, clip), spent
+        yield "refined", judged(refined.track, clip, refined.deviation), spent
 
 
-def judged(track: Track, clip: Clip) -> Track:
+def judged(track: Track, clip: Clip, deviation: F32 | None = None) -> Track:
     """The track with the confidence that the pictures leave it."""
-    return track if clip.appearance is None else judge(track, clip.appearance)[0]
+    return track if clip.appearance is None else judge(track, clip.appearance, deviation)[0]
 
 
 def watched(video: Path, head: HeadModel) -> Clip:

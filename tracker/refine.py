@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 KEYS = 48  # frames, spread over the clip, that tell the albedo
 STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
 HELD_BYTES = 256 << 20  # of cut-out faces, about 100 s of them; a longer clip is read twice instead
-# Times the usual deviation of the skin or of the mouth's: well-fitted laughs and turns reach 2.8.
-TOLERATED = 3.0
 Frame = tuple[float, U8]
 
 
@@ -29,11 +27,12 @@ Frame = tuple[float, U8]
 class Refined:
     """A track, and how far its skin is from what it should look like.
 
-    photometric: [T] mean deviation of the grey levels, 1 in the clip's median; NaN where nothing was compared.
+    deviation: [T, 2] mean deviation of the grey levels, of all skin and of the mouth's, 1 in the clip's median; NaN
+    where nothing was compared.
     """
 
     track: Track
-    photometric: F32
+    deviation: F32
 
 
 def refine_track(
@@ -57,7 +56,7 @@ def refine_track(
     """
     photometry = photometry or Photometry()
     energy, x, observed, good = resume(track, landmarks, camera, head, evidence)
-    unknown = np.full(len(track.time), np.nan, np.float32)
+    unknown = np.full((len(track.time), 2), np.nan, np.float32)
     if not len(good):
         return Refined(track, unknown)
     subject = Subject.of(head, track.identity, energy, photometry)
@@ -81,7 +80,7 @@ def refine_track(
     out = make_track(
         landmarks, camera, head, energy, observed, track.identity.astype(np.float64), refined, good
     )
-    return _judged(out, deviation, good, unknown)
+    return Refined(out, _relative(deviation, good, len(track.time)))
 
 
 def _looked_at(
@@ -120,15 +119,9 @@ def _stretches(cuts: Iterable[tuple[int, U8]], total: int) -> Iterator[tuple[int
         yield start, held
 
 
-def _judged(track: Track, deviation: F64, good: Index, unknown: F32) -> Refined:
-    """The track with less confidence where the skin, or the mouth's alone, looks other than usual: covered, blurred.
-
-    deviation: [n, 2] of the frames `good`.
-    """
-    usual = np.maximum(np.nanmedian(deviation, axis=0), 1e-9) if np.isfinite(deviation).any() else np.ones(2)
-    ratio = deviation / usual
-    excess = np.maximum(np.nan_to_num(ratio, nan=0.0).max(1) - TOLERATED, 0.0)
-    confidence, photometric = track.confidence.copy(), unknown.copy()
-    confidence[good] *= np.exp(-excess).astype(np.float32)
-    photometric[good] = ratio[:, 0]
-    return Refined(replace(track, confidence=confidence), photometric)
+def _relative(deviation: F64, good: Index, total: int) -> F32:
+    """[T, 2] times the median, of deviations [n, 2] of the frames `good`."""
+    out = np.full((total, 2), np.nan, np.float32)
+    if np.isfinite(deviation).any():
+        out[good] = deviation / np.maximum(np.nanmedian(deviation, axis=0), 1e-9)
+    return out

@@ -29,7 +29,7 @@ from tracker.head import load_head
 SECONDS, FPS, SIDE = 12.0, 25.0, 320
 ITERATIONS = "60"
 STAGES = (
-    *("ingest", "landmarks", "camera", "track", "refine", "overlay"),
+    *("ingest", "landmarks", "camera", "track", "refine", "judge", "overlay"),
     *("registration", "finetune", "evaluate"),
 )
 
@@ -119,7 +119,7 @@ def content(out: Path) -> dict[str, str]:
 
 def test_killed_in_every_stage_it_ends_in_the_same_result(talk: Path, finished: Path) -> None:
     out = talk.with_name("killed")
-    folders = {"evaluate": "evaluation"}
+    folders = {"evaluate": "evaluation", "refine": "photometric", "judge": "refine"}
     for stage in STAGES:
         process = start(talk, out)
         partial = out / f".{folders.get(stage, stage)}.partial"

@@ -96,7 +96,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     track = dataclasses.replace(track, valid=valid, confidence=confidence)
     write_track(run.path / "refine/track.npz", track)
     reasons = ["ok" if used else "blurred" for used in valid]
-    write_quality(run.path / "refine/quality.csv", track, reasons)
+    write_quality(run.path / "refine/quality.csv", track, reasons, np.ones(len(track.time), np.float32))
     return run
 
 

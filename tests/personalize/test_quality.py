@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from personalize.pipeline import STAGES
 from personalize.quality import frame_reasons, left_out, read_reasons, write_quality
 from personalize.shots import REASONS, Frames
 from tests.personalize.test_registration import track_of
@@ -42,6 +43,10 @@ def test_quality_csv_carries_the_reasons(frames, track, tmp_path: Path):
     assert read_reasons(tmp_path / "quality.csv").tolist() == reasons
     rows = list(csv.DictReader((tmp_path / "quality.csv").open(newline="")))
     assert [row["photometric"] for row in rows] == ["", "", "3.000", "1.500", "1.000", "0.500"]
+
+
+def test_another_threshold_judges_again_and_makes_nothing_else():
+    assert [stage.name for stage in STAGES if "min_confidence" in stage.reads] == ["judge"]
 
 
 def test_spans_end_where_the_next_frame_begins():
