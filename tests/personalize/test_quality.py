@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from personalize.evaluation.report import _apart
 from personalize.pipeline import STAGES
 from personalize.quality import frame_reasons, left_out, read_reasons, write_quality
 from personalize.shots import REASONS, Frames
@@ -55,3 +56,10 @@ def test_spans_end_where_the_next_frame_begins():
     assert spans == [(0.04, 0.12, "occluded"), (0.12, 0.16, "cut"), (0.2, 0.24, "no_face")]
     assert left_out(TIME, np.array(["ok"] * 6)) == []
     assert left_out(TIME[:1], np.array(["cut"]))[0].end_s == 0
+
+
+def test_cuts_have_no_row_of_their_own_in_the_report():
+    spans = left_out(TIME, np.array(["ok", "occluded", "cut", "ok", "cut", "no_face"]))
+    told, cuts = _apart(spans)
+    assert [span.reason for span in told] == ["occluded", "no_face"]
+    assert sum(cut.end_s - cut.start_s for cut in cuts) == pytest.approx(0.08)
