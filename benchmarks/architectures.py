@@ -29,8 +29,8 @@ from model.speech import load_encoder
 from model.synthesis import synthesize
 from model.trainer import Trainer
 from model.training_config import TrainingConfig
-from personalize.media import read_audio
 from personalize.run import RunFolder
+from personalize.sound import read_audio
 from personalize.subject_data import BASE_CHECKPOINT, load_subject_data, speech_features
 from personalize.talkers.film import ASSETS
 from personalize.talkers.motion import talker_motion

@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.ground_truth import GroundTruth
 from benchmarks.track_errors import rotation_error
+from personalize.container import probe
 from personalize.ingest import find_usable
-from personalize.media import probe, read_frames
+from personalize.pictures import read_frames
 from tracker.camera import estimate_camera
 from tracker.head import HeadModel, load_head
 from tracker.landmarker import track_landmarks

@@ -20,9 +20,9 @@ from benchmarks.rendered_heads import FPS, Scene, scene_motion, stranger
 from personalize import talkers, video_writer
 from personalize.feature_cache import cache_folder
 from personalize.files import sha256_json
-from personalize.media import VideoWriter
 from personalize.talkers.motion import TalkerMotion
 from personalize.talkers.skin import backdrop, painted, seen_faces, skin_block, texture
+from personalize.video_writer import VideoWriter
 from tracker import raster
 from tracker.head import HeadModel
 from tracker.raster import project, rasterize, shade, vertex_normals

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from personalize.media import read_frames
+from personalize.pictures import read_frames
 from tracker.landmarker import FaceLandmarker, LandmarkTracker
 
 FRAMES = 150

@@ -39,8 +39,9 @@ from benchmarks.in_model import noisy_landmarks
 from benchmarks.rendered_heads import SCENES
 from benchmarks.track_bars import Row, print_bars
 from benchmarks.track_errors import compare
+from personalize.container import probe
 from personalize.ingest import find_usable
-from personalize.media import probe, read_frames
+from personalize.pictures import read_frames
 from tracker.camera import estimate_camera
 from tracker.confidence import bare, judge
 from tracker.fit import fit_track
@@ -49,7 +50,7 @@ from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.landmarker import track_landmarks
 from tracker.occlusion import Appearance, FaceWatch
 from tracker.refine import refine_track
-from tracker.track import Bundle, Camera, Landmarks, Track
+from tracker.track import F32, Bundle, Camera, Landmarks, Track
 
 PERSONS, PERSON_FRAMES = 3, 500
 COLUMNS = {
@@ -106,12 +107,12 @@ def stages(clip: Clip, head: HeadModel) -> Iterator[tuple[str, Track, float]]:
             *(track, landmarks, camera, head, clip.segment, lambda: read_frames(video)), evidence=evidence
         )
         spent += 1e3 * (time.process_time() - start) / count
-        yield "refined", judged(refined.track, clip), spent
+        yield "refined", judged(refined.track, clip, refined.deviation), spent
 
 
-def judged(track: Track, clip: Clip) -> Track:
+def judged(track: Track, clip: Clip, deviation: F32 | None = None) -> Track:
     """The track with the confidence that the pictures leave it."""
-    return track if clip.appearance is None else judge(track, clip.appearance)[0]
+    return track if clip.appearance is None else judge(track, clip.appearance, deviation)[0]
 
 
 def watched(video: Path, head: HeadModel) -> Clip:

@@ -15,11 +15,12 @@ from model.speech import SpeechEncoder, load_encoder
 from model.synthesis import synthesize
 from personalize.errors import UserError
 from personalize.files import sha256_file
-from personalize.media import VideoWriter, on_video_clock, read_audio
 from personalize.render.face import FaceCamera
 from personalize.reporter import Reporter
 from personalize.run import tool_version
+from personalize.sound import on_video_clock, read_audio
 from personalize.subject_data import speech_features
+from personalize.video_writer import VideoWriter
 
 F32 = NDArray[np.float32]
 

@@ -12,9 +12,9 @@ from model.motion import FPS, principal_modes
 from model.motion_basis import MotionBasis
 from model.speech import SpeechEncoder
 from personalize.errors import UserError
-from personalize.media import AUDIO_RATE
 from personalize.protocol import Reference, Subject, speech_at
 from personalize.reporter import Reporter
+from personalize.sound import AUDIO_RATE
 from personalize.vocaset import ADAPT_TRAIN, ADAPT_VAL, ALL, TEST, TRAIN, UNSHARED, VAL, Vocaset
 
 

@@ -20,10 +20,10 @@ from model.speech import SpeechEncoder
 from personalize.animation import AUDIO_RATE, load_subject, read_speech, sample_folder, write_sample
 from personalize.errors import UserError
 from personalize.files import sha256_file
-from personalize.media import on_video_clock
 from personalize.regions import kept_share
 from personalize.reporter import Reporter
 from personalize.run import tool_version
+from personalize.sound import on_video_clock
 from personalize.subject_data import speech_features
 from personalize.times import frames_at
 

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from personalize.container import MediaInfo, probe
 from personalize.errors import UserError
-from personalize.media import MediaInfo, on_video_clock, probe, read_audio, read_frames
 from personalize.people import FaceFollower, Tracklet, main_person
+from personalize.pictures import read_frames
 from personalize.shots import (
     MAX_GAP_S,
     MIN_SHOT_S,
@@ -24,6 +25,7 @@ from personalize.shots import (
     find_shots,
     usable_seconds,
 )
+from personalize.sound import on_video_clock, read_audio
 from personalize.split import make_split
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.landmarker import FaceLandmarker

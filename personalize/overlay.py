@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from personalize.errors import UserError
 from personalize.files import write_atomic
-from personalize.media import VideoWriter, on_video_clock, read_audio, read_frames
+from personalize.pictures import read_frames
 from personalize.render.track import TrackPictures, grid
 from personalize.run import RunFolder
+from personalize.sound import on_video_clock, read_audio
+from personalize.video_writer import VideoWriter
 from tracker.head import HeadModel
 from tracker.overlay import MODES
 

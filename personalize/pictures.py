@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
 from personalize.container import MAX_DURATION_S, Source, display_matrix, frame_time, probe, square_size
@@ -33,6 +34,9 @@ class FrameReader(Iterator[tuple[float, U8]]):
         self._max_side = max_side
         self.info = probe(self._path)
         self.damaged = False
+        self._reformatter = (
+            VideoReformatter()
+        )  # one for all pictures: making its tables takes longer than its work
         self._pictures = self._read()
 
     def __next__(self) -> tuple[float, U8]:
@@ -58,31 +62,30 @@ class FrameReader(Iterator[tuple[float, U8]]):
                     damage_end = -1.0
                 self.damaged = time <= damage_end
                 last = time
-                yield time, _turned(_to_rgb(frame, size), matrix)
+                yield time, _turned(self._to_rgb(frame, size), matrix)
 
     def _size(self, width: int, height: int) -> tuple[int, int]:
         scale = min(1.0, self._max_side / max(width, height)) if self._max_side else 1.0
         return max(1, round(width * scale)), max(1, round(height * scale))
 
+    def _to_rgb(self, frame: Any, size: tuple[int, int]) -> U8:
+        """Any pixel format to [height, width, 3] u8 at `size` (width, height), as stored."""
+        # HD that does not name its colours is BT.709 by convention; FFmpeg would take BT.601.
+        hd = frame.colorspace == _UNSPECIFIED_COLOUR and frame.height >= 720
+        rgb = self._reformatter.reformat(
+            frame,
+            width=size[0],
+            height=size[1],
+            format="rgb24",
+            interpolation="AREA" if frame.width > size[0] else "BICUBIC",
+            src_colorspace=_BT709 if hd else None,
+        )
+        return np.asarray(rgb.to_ndarray(), np.uint8)
+
 
 def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:
     """Pictures of a video, see FrameReader. `max_side`: shrink to at most this many px on the long side."""
     return FrameReader(path, max_side)
-
-
-def _to_rgb(frame: Any, size: tuple[int, int]) -> U8:
-    """Any pixel format to [height, width, 3] u8 at `size` (width, height), as stored."""
-    # HD that does not name its colours is BT.709 by convention; FFmpeg would take BT.601.
-    hd = frame.colorspace == _UNSPECIFIED_COLOUR and frame.height >= 720
-    rgb = frame.reformat(
-        width=size[0],
-        height=size[1],
-        format="rgb24",
-        interpolation="AREA" if frame.width > size[0] else "BICUBIC",
-        src_colorspace=_BT709 if hd else None,
-    )
-    array: U8 = rgb.to_ndarray()
-    return array
 
 
 def _turned(picture: U8, matrix: NDArray[np.int64]) -> U8:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from model.errors import ModelError
 from model.training_config import available_device
+from personalize.container import probe
 from personalize.errors import UserError
 from personalize.heads import run_head
-from personalize.media import probe
 from personalize.overlay import check_modes
 from personalize.reporter import Reporter
 from personalize.run import RunFolder
@@ -19,6 +19,7 @@ from personalize.stages import (
     Evaluate,
     Finetune,
     Ingest,
+    Judge,
     LandmarkStage,
     Overlay,
     ReadTracked,
@@ -36,6 +37,7 @@ STAGES: tuple[Stage, ...] = (
     CameraStage(),  # focal length and rigid head poses
     TrackStage(),  # identity, expression, pose: jointly over the clip
     Refine(),  # photometric refinement
+    Judge(),  # confidence, and which frames are used
     Overlay(),  # overlay.mp4, to check by eye
     Registration(),  # Track -> Motion at 30 fps
     Finetune(),  # Motion + speech -> checkpoint.safetensors

@@ -74,9 +74,8 @@ def left_out(time: NDArray[np.float64], reasons: NDArray[np.str_]) -> list[LeftO
     ]
 
 
-def write_quality(path: Path, track: Track, reasons: Sequence[str], photometric: F32 | None = None) -> None:
+def write_quality(path: Path, track: Track, reasons: Sequence[str], photometric: F32) -> None:
     """Write the table. photometric: [T], 1 in a usual frame of the clip, NaN and then empty where not compared."""
-    compared = np.full(len(track.time), np.nan, np.float32) if photometric is None else photometric
     stream = io.StringIO()
     table = csv.writer(stream, lineterminator="\n")
     table.writerow(COLUMNS)
@@ -91,7 +90,7 @@ def write_quality(path: Path, track: Track, reasons: Sequence[str], photometric:
                 int(track.valid[frame]),
                 f"{track.confidence[frame]:.3f}",
                 f"{track.reprojection_px[frame]:.3f}",
-                "" if np.isnan(compared[frame]) else f"{compared[frame]:.3f}",
+                "" if np.isnan(photometric[frame]) else f"{photometric[frame]:.3f}",
                 f"{track.lip_gap_mm[frame]:.3f}",
                 *(f"{angle:.2f}" for angle in angles[frame]),
                 reasons[frame],

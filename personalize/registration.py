@@ -21,11 +21,11 @@ from personalize.av_sync import estimate_av_offset
 from personalize.errors import UserError
 from personalize.files import write_json
 from personalize.heads import run_head
-from personalize.media import read_audio
 from personalize.quality import read_reasons
 from personalize.reporter import Reporter
 from personalize.run import RunFolder, read_frames, read_track, tool_version
 from personalize.settings import Settings
+from personalize.sound import read_audio
 from personalize.subject_data import base_path
 from tracker.head import HeadModel
 from tracker.track import Track

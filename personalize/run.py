@@ -18,6 +18,7 @@ from personalize.files import read_npz, sha256_file, write_json, write_npz
 from personalize.settings import Settings
 from personalize.shots import Frames
 from tracker.occlusion import Appearance
+from tracker.refine import Refined
 from tracker.track import Bundle, Camera, Landmarks, Track
 
 SCHEMA = 1
@@ -162,6 +163,17 @@ def read_appearance(path: Path) -> Appearance:
     """Inverse of `write_appearance`."""
     data: dict[str, Any] = read_npz(path)
     return Appearance(**data)
+
+
+def write_refined(folder: Path, refined: Refined) -> None:
+    """`photometric/track.npz` and `photometric/deviation.npz`."""
+    write_track(folder / "track.npz", refined.track)
+    write_npz(folder / "deviation.npz", deviation=refined.deviation)
+
+
+def read_refined(folder: Path) -> Refined:
+    """Inverse of `write_refined`."""
+    return Refined(read_track(folder / "track.npz"), read_npz(folder / "deviation.npz")["deviation"])
 
 
 def write_camera(folder: Path, camera: Camera, bundle: Bundle) -> None:

@@ -16,11 +16,12 @@ from personalize.files import sha256_file, sha256_json, write_json
 from personalize.finetune import finetune_run
 from personalize.heads import head_assets, run_head
 from personalize.ingest import ingest_video
-from personalize.media import read_frames, write_wav
 from personalize.overlay import write_overlay
+from personalize.pictures import read_frames
 from personalize.quality import frame_reasons, write_quality
 from personalize.registration import register_run
 from personalize.settings import Settings
+from personalize.sound import write_wav
 from personalize.stage import VIDEO, Context, Stage
 from personalize.subject_data import base_path
 from personalize.tracked import read_track_of
@@ -29,8 +30,7 @@ from tracker.confidence import bare, judge
 from tracker.fit import fit_track
 from tracker.landmarker import track_landmarks
 from tracker.occlusion import FaceWatch
-from tracker.refine import refine_track
-from tracker.track import F32, Track
+from tracker.refine import Refined, refine_track
 
 JUDGED = ("refine/track.npz", "refine/quality.csv")
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
@@ -140,14 +140,14 @@ class TrackStage(Stage):
 
 
 class Refine(Stage):
-    """The track again, with the grey levels of the skin, and judged by the pictures."""
+    """The track again, with the grey levels of the skin."""
 
-    name, version, reads = "refine", 2, ("min_confidence",)
+    name, folder, version = "refine", "photometric", 3
     needs = (
         *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),
     )
-    makes = ("track.npz", "quality.csv")
+    makes = ("track.npz", "deviation.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
         return head_assets(settings)
@@ -164,24 +164,14 @@ class Refine(Stage):
             context.report.progress,
             evidence=bare(files.read_appearance(root / "landmarks/appearance.npz")),
         )
-        write_judged(context, folder, refined.track, refined.photometric)
-
-
-def write_judged(context: Context, folder: Path, track: Track, photometric: F32 | None = None) -> None:
-    """Write the track with its confidence lowered by what the pictures tell, and quality.csv."""
-    root = context.run.path
-    judged, doubts = judge(track, files.read_appearance(root / "landmarks/appearance.npz"))
-    frames = files.read_frames(root / "ingest/frames.npz")
-    files.write_track(folder / "track.npz", judged)
-    reasons = frame_reasons(frames, judged, doubts, context.settings.min_confidence)
-    write_quality(folder / "quality.csv", judged, reasons, photometric)
+        files.write_refined(folder, refined)
 
 
 class ReadTracked(Stage):
     """Another tracker's result in the place of ours: camera, track and refine in one."""
 
-    name, version, reads = "refine", 2, Refine.reads
-    needs = ("ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz")
+    name, folder, version = "refine", "photometric", 3
+    needs = ("ingest/frames.npz", "landmarks/landmarks.npz")
     makes = Refine.makes
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -194,7 +184,29 @@ class ReadTracked(Stage):
         frames = files.read_frames(root / "ingest/frames.npz")
         landmarks = files.read_landmarks(root / "landmarks/landmarks.npz")
         track = read_track_of(Path(str(settings.tracked)), run_head(settings), frames, landmarks)
-        write_judged(context, folder, track)
+        nothing_compared = np.full((len(track.time), 2), np.nan, np.float32)
+        files.write_refined(folder, Refined(track, nothing_compared))
+
+
+class Judge(Stage):
+    """The refined track with its confidence lowered by what the pictures tell, and which frames are used."""
+
+    name, folder, version, reads = "judge", "refine", 1, ("min_confidence",)
+    needs = (
+        *("ingest/frames.npz", "landmarks/appearance.npz"),
+        *("photometric/track.npz", "photometric/deviation.npz"),
+    )
+    makes = ("track.npz", "quality.csv")
+
+    def make(self, context: Context, folder: Path) -> None:
+        root = context.run.path
+        refined = files.read_refined(root / "photometric")
+        appearance = files.read_appearance(root / "landmarks/appearance.npz")
+        judged, doubts = judge(refined.track, appearance, refined.deviation)
+        frames = files.read_frames(root / "ingest/frames.npz")
+        files.write_track(folder / "track.npz", judged)
+        reasons = frame_reasons(frames, judged, doubts, context.settings.min_confidence)
+        write_quality(folder / "quality.csv", judged, reasons, refined.deviation[:, 0])
 
 
 class Overlay(Stage):

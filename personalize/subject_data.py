@@ -14,9 +14,9 @@ from model.dataset import Sequence
 from model.motion import Motion
 from model.speech import SpeechEncoder, load_encoder, resample
 from personalize.feature_cache import encode_cached
-from personalize.media import read_audio
 from personalize.run import RunFolder
 from personalize.settings import Settings
+from personalize.sound import read_audio
 
 BASE_CHECKPOINT = Path(__file__).parent.parent / "model" / "assets" / "base.safetensors"
 Part = Literal["train", "val", "test"]

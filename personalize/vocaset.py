@@ -23,8 +23,8 @@ from scipy.signal import resample_poly
 from model.motion import FPS
 from model.speech import resample
 from personalize.errors import UserError
-from personalize.media import AUDIO_RATE, read_audio
 from personalize.restricted_pickle import read_pickle
+from personalize.sound import AUDIO_RATE, read_audio
 
 F32 = NDArray[np.float32]
 

@@ -43,7 +43,7 @@ class Skin:
 
     triangles: NDArray[np.int64]
     barycentric: F32
-    rest: F64
+    rest: F32
     expression: F32
     mouth: Bool
     to_inside: F32
@@ -66,7 +66,7 @@ def skin_of(head: HeadModel, model: LandmarkModel, identity: F32) -> Skin:
     return Skin(
         triangles=triangles[chosen],
         barycentric=share,
-        rest=points - model.centre,
+        rest=(points - model.centre).astype(np.float32),
         expression=np.ascontiguousarray(moves @ model.modes.to_head.T, np.float32),
         mouth=distance < MOUTH_M,
         to_inside=_to_line(points, [neutral[head.regions[f"inner_lip_{lip}"]] for lip in ("upper", "lower")]),

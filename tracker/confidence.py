@@ -12,6 +12,8 @@ from tracker.occlusion import Appearance
 from tracker.track import F32, F64, Track
 
 TOLERATED = 1.5  # residuals up to this many times the clip's median cost nothing
+# The same of the deviation of the skin or of the mouth's: well-fitted laughs and turns reach 2.8.
+TOLERATED_SKIN = 3.0
 # What costs nothing, and what leaves half of the confidence.
 STRANGE, STRANGE_HALF = 0.10, 0.15  # see Appearance: bare faces stay below .12 in 99.5 % of the frames
 SHARP, SHARP_HALF = 0.70, 0.55  # of the clip's median
@@ -48,20 +50,27 @@ def bare(appearance: Appearance) -> F32:
     return _factor(appearance.strangeness, STRANGE, STRANGE_HALF).astype(np.float32)
 
 
-def judge(track: Track, appearance: Appearance) -> tuple[Track, list[str]]:
+def judge(track: Track, appearance: Appearance, deviation: F32 | None = None) -> tuple[Track, list[str]]:
     """The track with its confidence lowered by what the pictures and the pose tell, and the main doubt of each frame.
 
+    deviation: [T, 2], see `refine.Refined`; None where no skin was compared.
     Doubts: `poor_fit`, `occluded`, `blurred`, `turned_away`; a frame's is the one that costs it the most.
     """
     factors = {
         "occluded": bare(appearance),
         "blurred": _factor(-appearance.sharpness, -SHARP, -SHARP_HALF),
         "turned_away": _factor(off_axis_deg(track), FACING_DEG, FACING_HALF_DEG),
-        "poor_fit": track.confidence,
+        "poor_fit": track.confidence if deviation is None else track.confidence * _usual_skin(deviation),
     }
     each = np.stack([np.asarray(values, np.float32) for values in factors.values()])
     doubts = [tuple(factors)[index] for index in each.argmin(0)]
     return replace(track, confidence=each.prod(0)), doubts
+
+
+def _usual_skin(deviation: F32) -> F32:
+    """[T] 0..1, less where the skin, or the mouth's alone, looks other than usual: covered, blurred."""
+    excess = np.nan_to_num(deviation, nan=0.0).max(1) - TOLERATED_SKIN
+    return np.exp(-np.maximum(excess, 0.0))
 
 
 def _factor(value: NDArray[np.floating], free: float, half: float) -> F64:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from tracker.jacobian import fill_rows
 from tracker.modes import Modes, head_modes, movements
 from tracker.track import F64
 
@@ -225,15 +226,11 @@ class Energy:
         value, weight = self._robust(residual)
         moves = np.concatenate([model.identity, model.expression]) if with_identity else model.expression
         slope = self._projection_slope(camera)
-        rotation = rotation_matrix(x[:, -6:-3])
-        directions = np.einsum("nlik,nkj->nlij", slope, rotation)
         # Single precision from here: it halves the time of the fit, and residuals stay in double.
         jacobian = np.empty((count, len(model.mean), 2, len(moves) + POSE), np.float32)
-        columns = moves.transpose(1, 2, 0).astype(np.float32)
-        np.matmul(directions.astype(np.float32), columns, out=jacobian[..., :-POSE])
-        swing = np.cross(turned[:, :, None, :], slope)
-        jacobian[..., -6:-3] = np.einsum("nlik,nkj->nlij", swing, left_jacobian(x[:, -6:-3]))
-        jacobian[..., -3:] = slope
+        poses = turned, slope, rotation_matrix(x[:, -6:-3]), left_jacobian(x[:, -6:-3])
+        parts = (*poses, np.ascontiguousarray(moves.transpose(1, 2, 0)))
+        fill_rows(*(part.astype(np.float32) for part in parts), jacobian)
         rows = self._with_pairs(jacobian)
         rows *= (np.sqrt(weight) * scale).astype(np.float32)[..., None, None]
         rows = rows.reshape(count, -1, rows.shape[-1])

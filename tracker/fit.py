@@ -133,17 +133,23 @@ def _start(
     translation = ray / px_per_m[:, None]
     rotation = rotation_vector(matrix)
     x = np.concatenate([np.zeros((len(seen), model.expressions)), rotation, translation], axis=1)
-    energy = Energy(
+    return _energy(model, weights, camera, observed, px_per_m, x), x
+
+
+def _energy(
+    model: LandmarkModel, weights: Weights, camera: Camera, observed: F64, px_per_m: F64, x: F64
+) -> Energy:
+    """Of landmarks observed [n, 478, 2] px, seen as the poses of x [n, P] turn them."""
+    return Energy(
         model=model,
         weights=weights,
         focal=camera.focal_px,
-        principal=principal,
+        principal=np.array(camera.principal_px, np.float64),
         observed=observed[:, model.landmarks],
         px_per_m=px_per_m,
-        visible=visibility(model, rotation, translation),
-        strictness=np.ones(len(seen)),
+        visible=visibility(model, x[:, -6:-3], x[:, -3:]),
+        strictness=np.ones(len(x)),
     )
-    return energy, x
 
 
 def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
@@ -210,18 +216,10 @@ def resume(
     turn = torch.from_numpy(track.rotation[good].astype(np.float64))
     matrix = axis_angle_to_rotation_matrix(turn).numpy()
     rotation, translation = rotation_vector(matrix), track.translation[good] + matrix @ model.centre
-    energy = Energy(
-        model=model,
-        weights=weights,
-        focal=camera.focal_px,
-        principal=np.array(camera.principal_px, np.float64),
-        observed=observed[:, model.landmarks],
-        px_per_m=camera.focal_px / translation[:, 2],
-        visible=visibility(model, rotation, translation) * _share(evidence, good)[:, None],
-        strictness=np.ones(len(good)),
-    )
     moved = track.expression[good].astype(np.float64), track.jaw[good].astype(np.float64)
     x = np.concatenate([model.modes.of_head(*moved), rotation, translation], axis=1)
+    energy = _energy(model, weights, camera, observed, camera.focal_px / translation[:, 2], x)
+    energy = replace(energy, visible=energy.visible * _share(evidence, good)[:, None])
     if len(good):
         energy = with_lips_shut(energy, x, key_frames(observed, energy.px_per_m)[0])
     return energy, x, observed, good

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from tracker.appearance import Skin
 from tracker.energy import POSE, Energy, LandmarkModel, Quadratic, left_jacobian, rotation_matrix
+from tracker.jacobian import add_squares
 from tracker.track import F32, F64
 from tracker.view import Rows, View
 
@@ -66,39 +66,32 @@ class PhotometricEnergy:
     def linearize_skin(self, x: F64) -> Quadratic:
         """The part of the grey levels alone, nothing taken off."""
         turned, camera = self._points(x)
-        grey, slope = self.view.read(self._pixels(camera))
+        grey, push = self._read(camera)
         residual = grey - self.expected
         value, weight = self._robust(residual)
-        push = self._push(camera, slope)
-        swing = np.cross(turned, push) @ left_jacobian(x[:, -6:-3])
-        along = push @ rotation_matrix(x[:, -6:-3])
-        slopes = np.concatenate([along, swing, push], axis=-1, dtype=np.float32)
-        rows = np.empty((len(self.skin), x.shape[1] + 1), np.float32)
-        square = np.empty((len(x), x.shape[1] + 1, x.shape[1] + 1))
-        for n in range(len(x)):
-            used = rows[: _jacobian(slopes[n], self.skin.expression, weight[n], residual[n], rows)]
-            square[n] = used.T @ used
-        return Quadratic(value, square[:, :-1, -1], square[:, :-1, :-1])
+        rotation, swing = rotation_matrix(x[:, -6:-3]), left_jacobian(x[:, -6:-3])
+        square = np.zeros((len(x), x.shape[1] + 1, x.shape[1] + 1), np.float32)
+        add_squares(
+            *(turned, push, rotation.astype(np.float32), swing.astype(np.float32)),
+            *(self.skin.expression, weight, residual, square),
+        )
+        whole = square.astype(np.float64)
+        return Quadratic(value, whole[:, :-1, -1], whole[:, :-1, :-1])
 
     def grey(self, x: F64) -> F32:
         """[n, P] grey levels of the pictures where the points lie at x [n, U]."""
-        return self.view.read(self._pixels(self._points(x)[1]))[0]
+        return self._read(self._points(x)[1])[0]
 
-    def _points(self, x: F64) -> tuple[F64, F64]:
+    def _points(self, x: F64) -> tuple[F32, F32]:
         """[n, P, 3] m: turned about the landmarks' centre, and in the camera frame."""
-        moved = self.skin.expression @ x[:, :-POSE].T.astype(np.float32)
-        face = self.skin.rest + moved.transpose(2, 0, 1)
-        turned = face @ rotation_matrix(x[:, -6:-3]).transpose(0, 2, 1)
-        return turned, turned + x[:, None, -3:]
+        expression = self.skin.expression
+        moved = x[:, :-POSE].astype(np.float32) @ expression.reshape(-1, expression.shape[2]).T
+        face = self.skin.rest + moved.reshape(len(x), -1, 3)
+        turned = face @ rotation_matrix(x[:, -6:-3]).transpose(0, 2, 1).astype(np.float32)
+        return turned, turned + x[:, None, -3:].astype(np.float32)
 
-    def _pixels(self, camera: F64) -> F64:
-        return self.landmarks.focal * camera[..., :2] / camera[..., 2:] + self.landmarks.principal
-
-    def _push(self, camera: F64, slope: F32) -> F64:
-        """[n, P, 3] grey levels per m: the picture's slope [n, P, 2] through the projection."""
-        flat = self.landmarks.focal / camera[..., 2:] * slope
-        depth = -(flat * camera[..., :2]).sum(-1, keepdims=True) / camera[..., 2:]
-        return np.concatenate([flat, depth], axis=-1)
+    def _read(self, camera: F32) -> tuple[F32, F32]:
+        return self.view.read(camera, self.landmarks.focal, self.landmarks.principal)
 
     def _robust(self, residual: F32) -> tuple[F64, F32]:
         """Half the Cauchy loss of each frame [n], and each point's weight [n, P] per squared grey level."""
@@ -107,25 +100,3 @@ class PhotometricEnergy:
         scale = np.float32(0.5 * self.robust**2)
         loss = scale * (self.seen * np.log1p(square)).sum(1, dtype=np.float64)
         return loss, self.seen / (self.noise**2 * (1 + square))
-
-
-@njit(cache=True)
-def _jacobian(slopes, expression, weight, residual, rows):  # type: ignore[no-untyped-def]
-    """Rows [derivatives by the unknowns, residual] of the points that count, times the root of their weight.
-
-    slopes: [P, 9], derivative by a shift in the head frame, by rotation, by translation. Returns how many rows.
-    """
-    count, shapes = 0, expression.shape[2]
-    for p in range(len(slopes)):
-        if weight[p] <= 0:
-            continue
-        root, row = np.sqrt(weight[p]), rows[count]
-        a, b, c = root * slopes[p, 0], root * slopes[p, 1], root * slopes[p, 2]
-        x, y, z = expression[p]
-        for k in range(shapes):
-            row[k] = a * x[k] + b * y[k] + c * z[k]
-        for k in range(6):
-            row[shapes + k] = root * slopes[p, 3 + k]
-        row[shapes + 6] = root * residual[p]
-        count += 1
-    return count

@@ -93,7 +93,7 @@ def shade(
     normals = vertex_normals(vertices_cam, faces)
     # Squares stand for linear light: close to sRGB's curve and cheap.
     reflectance = (albedo.astype(np.float32) / 255) ** 2
-    brightness = ambient + (1 - ambient) * np.maximum(normals @ direction, 0)
+    brightness = ambient + (1 - ambient) * np.maximum(normals @ direction, 0)[:, None]
     corners = np.ascontiguousarray(faces, np.int32)
     _paint(raster.triangle, raster.barycentric, corners, reflectance, brightness.astype(np.float32), picture)
     return picture
@@ -128,26 +128,29 @@ def render(
 def _fill(vertices, faces, cull, triangle, barycentric, inverse_depth):  # type: ignore[no-untyped-def]
     height, width = triangle.shape
     for f in range(len(faces)):
-        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        if not (a[2] > 0 and b[2] > 0 and c[2] > 0):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, az = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        bx, by, bz = vertices[j, 0], vertices[j, 1], vertices[j, 2]
+        cx, cy, cz = vertices[k, 0], vertices[k, 1], vertices[k, 2]
+        if not (az > 0 and bz > 0 and cz > 0):
             continue
-        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         # y runs down: what faces the camera has a negative area. The test also refuses what is not finite.
         if not 0 < abs(area) < 1e12 or (cull and area > 0):
             continue
-        left = max(0, int(np.ceil(max(min(a[0], b[0], c[0]), -1e6))))
-        right = min(width - 1, int(np.floor(min(max(a[0], b[0], c[0]), 1e6))))
-        top = max(0, int(np.ceil(max(min(a[1], b[1], c[1]), -1e6))))
-        bottom = min(height - 1, int(np.floor(min(max(a[1], b[1], c[1]), 1e6))))
+        left = max(0, int(np.ceil(max(min(ax, bx, cx), -1e6))))
+        right = min(width - 1, int(np.floor(min(max(ax, bx, cx), 1e6))))
+        top = max(0, int(np.ceil(max(min(ay, by, cy), -1e6))))
+        bottom = min(height - 1, int(np.floor(min(max(ay, by, cy), 1e6))))
         for y in range(top, bottom + 1):
             for x in range(left, right + 1):
-                u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
-                v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
-                w = ((a[0] - x) * (b[1] - y) - (a[1] - y) * (b[0] - x)) / area
-                if u < 0 or v < 0 or w < 0:
+                u = (bx - x) * (cy - y) - (by - y) * (cx - x)
+                v = (cx - x) * (ay - y) - (cy - y) * (ax - x)
+                w = (ax - x) * (by - y) - (ay - y) * (bx - x)
+                if u * area < 0 or v * area < 0 or w * area < 0:
                     continue
                 # 1 / depth and weight / depth are linear on the screen.
-                p, q, r = u / a[2], v / b[2], w / c[2]
+                p, q, r = u / area / az, v / area / bz, w / area / cz
                 nearness = p + q + r
                 if nearness > inverse_depth[y, x]:
                     inverse_depth[y, x] = nearness
@@ -161,11 +164,11 @@ def _fill(vertices, faces, cull, triangle, barycentric, inverse_depth):  # type:
 def _normals(vertices, faces):  # type: ignore[no-untyped-def]
     normals = np.zeros_like(vertices)
     for f in range(len(faces)):
-        i, j, k = faces[f]
-        e, g = vertices[j] - vertices[i], vertices[k] - vertices[i]
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
         for axis in range(3):
             n, m = (axis + 1) % 3, (axis + 2) % 3
-            cross = e[n] * g[m] - e[m] * g[n]
+            cross = (vertices[j, n] - vertices[i, n]) * (vertices[k, m] - vertices[i, m])
+            cross -= (vertices[j, m] - vertices[i, m]) * (vertices[k, n] - vertices[i, n])
             normals[i, axis] += cross
             normals[j, axis] += cross
             normals[k, axis] += cross
@@ -181,15 +184,9 @@ def _spread(triangle, barycentric, faces, field, values):  # type: ignore[no-unt
     height, width = triangle.shape
     for y in range(height):
         for x in range(width):
-            if triangle[y, x] < 0:
-                continue
-            corner = faces[triangle[y, x]]
-            weight = barycentric[y, x]
-            for channel in range(field.shape[1]):
-                value = np.float32(0)
-                for k in range(3):
-                    value += weight[k] * field[corner[k], channel]
-                values[y, x, channel] = value
+            if triangle[y, x] >= 0:
+                for channel in range(field.shape[1]):
+                    values[y, x, channel] = _value(triangle, barycentric, faces, field, y, x, channel)
 
 
 @njit(cache=True)
@@ -197,15 +194,17 @@ def _paint(triangle, barycentric, faces, reflectance, brightness, picture):  # t
     height, width = triangle.shape
     for y in range(height):
         for x in range(width):
-            if triangle[y, x] < 0:
-                continue
-            corner = faces[triangle[y, x]]
-            weight = barycentric[y, x]
-            light = np.float32(0)
-            for k in range(3):
-                light += weight[k] * brightness[corner[k]]
-            for channel in range(3):
-                value = np.float32(0)
-                for k in range(3):
-                    value += weight[k] * reflectance[corner[k], channel]
-                picture[y, x, channel] = np.uint8(min(255 * np.sqrt(value * light) + 0.5, 255))
+            if triangle[y, x] >= 0:
+                light = _value(triangle, barycentric, faces, brightness, y, x, 0)
+                for channel in range(3):
+                    value = _value(triangle, barycentric, faces, reflectance, y, x, channel)
+                    picture[y, x, channel] = np.uint8(min(255 * np.sqrt(value * light) + 0.5, 255))
+
+
+@njit(cache=True)
+def _value(triangle, barycentric, faces, field, y, x, channel):  # type: ignore[no-untyped-def]
+    """One channel of a vertex field on the surface that pixel (x, y) sees."""
+    value = np.float32(0)
+    for k in range(3):
+        value += barycentric[y, x, k] * field[faces[triangle[y, x], k], channel]
+    return value

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,10 +17,9 @@ from tracker.view import U8, Index
 if TYPE_CHECKING:
     from tracker.head import HeadModel
 
-KEYS = 64  # frames, spread over the clip, that tell the albedo
+KEYS = 48  # frames, spread over the clip, that tell the albedo
 STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
-# Times the usual deviation of the skin or of the mouth's: well-fitted laughs and turns reach 2.8.
-TOLERATED = 3.0
+HELD_BYTES = 256 << 20  # of cut-out faces, about 100 s of them; a longer clip is read twice instead
 Frame = tuple[float, U8]
 
 
@@ -28,11 +27,12 @@ Frame = tuple[float, U8]
 class Refined:
     """A track, and how far its skin is from what it should look like.
 
-    photometric: [T] mean deviation of the grey levels, 1 in the clip's median; NaN where nothing was compared.
+    deviation: [T, 2] mean deviation of the grey levels, of all skin and of the mouth's, 1 in the clip's median; NaN
+    where nothing was compared.
     """
 
     track: Track
-    photometric: F32
+    deviation: F32
 
 
 def refine_track(
@@ -49,29 +49,28 @@ def refine_track(
     """Expression, pose and gaze of the valid frames again, with the pictures; identity and camera stay.
 
     segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
-    each row of the landmarks; it is called twice. A frame whose skin does not come nearer to what it should look
-    like keeps its landmark fit, and so does one whose picture is missing. evidence: see `fit_track`.
+    each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
+    look like keeps its landmark fit, and so does one whose picture is missing. evidence: see `fit_track`.
     What it gains is printed by `python -m benchmarks tracking`: pose and jitter mostly; the lips' openings are left
     to the landmarks, see `Photometry.pair_noise_mm`.
     """
     photometry = photometry or Photometry()
     energy, x, observed, good = resume(track, landmarks, camera, head, evidence)
-    unknown = np.full(len(track.time), np.nan, np.float32)
+    unknown = np.full((len(track.time), 2), np.nan, np.float32)
     if not len(good):
         return Refined(track, unknown)
     subject = Subject.of(head, track.identity, energy, photometry)
-    wanted = np.unique(np.linspace(0, len(good) - 1, KEYS).round().astype(int))
-    keys = dict(_cuts(subject, camera, frames(), good[wanted], wanted))
+    keys, cuts = _looked_at(subject, camera, frames, good)
     if not keys:
         return Refined(track, unknown)
     rows = np.array(list(keys))
     levels = learn_levels(subject, list(keys.values()), rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
     refined = x.copy()
-    for start, cuts in _stretches(_cuts(subject, camera, frames(), good, np.arange(len(good))), len(good)):
-        rows = np.array(list(cuts))
+    for start, part in _stretches(cuts, len(good)):
+        rows = np.array(list(part))
         smoothness = smoothness_between(energy, landmarks.time, good[rows], segment, photometry.smoothness)
-        found, before, after = fit_stretch(subject, levels, list(cuts.values()), rows, x[rows], smoothness)
+        found, before, after = fit_stretch(subject, levels, list(part.values()), rows, x[rows], smoothness)
         better = np.isfinite(found).all(1) & (after[:, 0] < before[:, 0])
         own = (rows >= start) & (rows < start + STRETCH)
         refined[rows[own & better]] = found[own & better]
@@ -81,7 +80,19 @@ def refine_track(
     out = make_track(
         landmarks, camera, head, energy, observed, track.identity.astype(np.float64), refined, good
     )
-    return _judged(out, deviation, good, unknown)
+    return Refined(out, _relative(deviation, good, len(track.time)))
+
+
+def _looked_at(
+    subject: Subject, camera: Camera, frames: Callable[[], Iterable[Frame]], good: Index
+) -> tuple[dict[int, U8], Iterable[tuple[int, U8]]]:
+    """Rows and cut-out faces of the key frames, and of all frames `good`; a short clip's pictures are read once."""
+    keys, rows = np.unique(np.linspace(0, len(good) - 1, KEYS).round().astype(int)), np.arange(len(good))
+    if len(good) * subject.window.size[0] * subject.window.size[1] > HELD_BYTES:
+        chosen = dict(_cuts(subject, camera, frames(), good[keys], keys))
+        return chosen, _cuts(subject, camera, frames(), good, rows)
+    held = dict(_cuts(subject, camera, frames(), good, rows))
+    return {row: held[row] for row in keys.tolist() if row in held}, held.items()
 
 
 def _cuts(
@@ -108,15 +119,9 @@ def _stretches(cuts: Iterable[tuple[int, U8]], total: int) -> Iterator[tuple[int
         yield start, held
 
 
-def _judged(track: Track, deviation: F64, good: Index, unknown: F32) -> Refined:
-    """The track with less confidence where the skin, or the mouth's alone, looks other than usual: covered, blurred.
-
-    deviation: [n, 2] of the frames `good`.
-    """
-    usual = np.maximum(np.nanmedian(deviation, axis=0), 1e-9) if np.isfinite(deviation).any() else np.ones(2)
-    ratio = deviation / usual
-    excess = np.maximum(np.nan_to_num(ratio, nan=0.0).max(1) - TOLERATED, 0.0)
-    confidence, photometric = track.confidence.copy(), unknown.copy()
-    confidence[good] *= np.exp(-excess).astype(np.float32)
-    photometric[good] = ratio[:, 0]
-    return Refined(replace(track, confidence=confidence), photometric)
+def _relative(deviation: F64, good: Index, total: int) -> F32:
+    """[T, 2] times the median, of deviations [n, 2] of the frames `good`."""
+    out = np.full((total, 2), np.nan, np.float32)
+    if np.isfinite(deviation).any():
+        out[good] = deviation / np.maximum(np.nanmedian(deviation, axis=0), 1e-9)
+    return out

@@ -204,9 +204,10 @@ def solve_frames(
         return float(sum(parts)) + smoothness.value(x)
 
     bounds = _bounds(energy)
-    damping, value = 1e-3, total(x)
+    damping, value = 1e-3, np.inf
     for step in range(steps):
-        gradient, hessian = _linearize(energy, shape, x)
+        value, gradient, hessian = _linearize(energy, shape, x)
+        value += smoothness.value(x)
         gradient += smoothness.gradient(x)
         while True:
             solve = partial(band_step, gradient, hessian, smoothness, damping)
@@ -235,12 +236,13 @@ def _chunks(n: int) -> list[slice]:
     return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
 
 
-def _linearize(energy: FrameEnergy, shape: F64, x: F64) -> tuple[F64, F64]:
-    gradient, hessian = np.empty(x.shape), np.empty((*x.shape, x.shape[1]))
+def _linearize(energy: FrameEnergy, shape: F64, x: F64) -> tuple[float, F64, F64]:
+    value, gradient, hessian = 0.0, np.empty(x.shape), np.empty((*x.shape, x.shape[1]))
     for part in _chunks(len(x)):
         quadratic = energy.select(part).linearize(shape, x[part])
+        value += float(quadratic.value.sum())
         gradient[part], hessian[part] = quadratic.gradient, quadratic.hessian
-    return gradient, hessian
+    return value, gradient, hessian
 
 
 def band_step(

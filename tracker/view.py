@@ -52,8 +52,8 @@ class Window:
             grey = cv2.copyMakeBorder(grey, top, bottom, left, right, cv2.BORDER_REPLICATE)
         return cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
 
-    def principal(self, principal: F64, row: int) -> F64:
-        """[2] px, the principal point in one cut picture."""
+    def principal(self, principal: F64, row: int | slice) -> F64:
+        """[2] px, the principal point in one cut picture, or [.., 2] in several."""
         return (principal - self.origin[row] + 0.5) * self.scale - 0.5
 
 
@@ -76,23 +76,27 @@ class View:
         """Some of the pictures."""
         return View(self.grey[rows], replace(self.window, origin=self.window.origin[rows]))
 
-    def read(self, pixels: F64) -> tuple[F32, F32]:
-        """Grey levels [n, P] at pixels [n, P, 2] of the whole picture, and their slopes [n, P, 2] per px of it."""
-        scale = self.window.scale
-        at = ((pixels - self.window.origin[:, None] + 0.5) * scale - 0.5).astype(np.float32)
-        value, slope = np.empty(at.shape[:2], np.float32), np.empty(at.shape, np.float32)
-        for picture, place, level, change in zip(self.grey, at, value, slope):
-            _bilinear(picture, place, level, change)
-        return value, slope * np.float32(scale)
+    def read(self, points: F32, focal: float, principal: F64) -> tuple[F32, F32]:
+        """Grey levels [n, P] where points [n, P, 3] m of the camera frame lie, and their slopes [n, P, 3] per m.
+
+        focal, principal: px of the whole picture.
+        """
+        value, slope = np.empty(points.shape[:2], np.float32), np.empty(points.shape, np.float32)
+        centres = self.window.principal(principal, slice(None)).astype(np.float32)
+        scaled = np.float32(focal * self.window.scale)
+        for picture, places, centre, level, change in zip(self.grey, points, centres, value, slope):
+            _bilinear(picture, places, scaled, centre, level, change)
+        return value, slope
 
 
 @njit(cache=True)
-def _bilinear(picture, pixels, value, slope):  # type: ignore[no-untyped-def]
+def _bilinear(picture, points, focal, centre, value, slope):  # type: ignore[no-untyped-def]
     """Outside of the picture the value is that of its border, the slope zero."""
     height, width = picture.shape
     half = np.float32(0.5)
-    for p in range(len(pixels)):
-        x, y = pixels[p, 0], pixels[p, 1]
+    for p in range(len(points)):
+        per_m = focal / points[p, 2]
+        x, y = per_m * points[p, 0] + centre[0], per_m * points[p, 1] + centre[1]
         inside = 0 <= x < width - 1 and 0 <= y < height - 1
         i = min(max(int(np.floor(x)), 0), width - 2) if x == x else 0
         j = min(max(int(np.floor(y)), 0), height - 2) if y == y else 0
@@ -101,5 +105,7 @@ def _bilinear(picture, pixels, value, slope):  # type: ignore[no-untyped-def]
         a, b, c, d = picture[j, i], picture[j, i + 1], picture[j + 1, i], picture[j + 1, i + 1]
         top, bottom = a + (b - a) * u, c + (d - c) * u
         value[p] = top + (bottom - top) * v
-        slope[p, 0] = (b - a) + ((d - c) - (b - a)) * v if inside else half * 0
-        slope[p, 1] = bottom - top if inside else half * 0
+        right = per_m * ((b - a) + ((d - c) - (b - a)) * v) if inside else half * 0
+        down = per_m * (bottom - top) if inside else half * 0
+        slope[p, 0], slope[p, 1] = right, down
+        slope[p, 2] = -(right * points[p, 0] + down * points[p, 1]) / points[p, 2]

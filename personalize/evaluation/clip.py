@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from model.checkpoint import Checkpoint
 from model.motion import Motion
-from personalize.media import VideoWriter, on_video_clock, read_audio, read_frames
+from personalize.pictures import read_frames
 from personalize.render.face import FaceCamera
 from personalize.render.text import caption
 from personalize.run import RunFolder, read_landmarks
+from personalize.sound import on_video_clock, read_audio
+from personalize.video_writer import VideoWriter
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]

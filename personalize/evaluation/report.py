@@ -45,7 +45,7 @@ def write_report(run: RunFolder, evaluation: Evaluation, modes: Sequence[str], f
     duration = float(track.time[-1])
     reasons = read_reasons(run.path / "refine/quality.csv")
     used = reasons == "ok"
-    gaps = left_out(track.time, reasons)
+    gaps, cuts = _apart(left_out(track.time, reasons))
     page = environment.get_template("report.html").render(
         video=run.video.name,
         version=tool_version(),
@@ -58,6 +58,8 @@ def write_report(run: RunFolder, evaluation: Evaluation, modes: Sequence[str], f
         timeline=charts.timeline(track.time, track.confidence, used),
         left_out=_longest(gaps),
         left_out_more=max(0, len(gaps) - LISTED),
+        cuts=len(cuts),
+        cuts_s=sum(cut.end_s - cut.start_s for cut in cuts),
         contact_sheet=_photograph_url(run.path / "overlay/contact_sheet.png"),
         clip=_data_url(folder / "samples/test.mp4", "video/mp4"),
         lip_opening=charts.lip_opening(evaluation.clip_time, evaluation.reference, evaluation.samples),
@@ -84,6 +86,11 @@ def _cards(systems: dict[str, dict[str, float]], duration: float, tracked: float
         {"value": f"{ours['l2_lip']:.2f} mm", "label": f"lip error (base {base['l2_lip']:.2f})"},
         {"value": f"{ours['lip_gap_r']:.2f}", "label": "correlation of lip opening"},
     ]
+
+
+def _apart(gaps: list[LeftOut]) -> tuple[list[LeftOut], list[LeftOut]]:
+    """The spans with a row of their own, and the cuts, mostly single frames, which would fill the table."""
+    return [gap for gap in gaps if gap.reason != "cut"], [gap for gap in gaps if gap.reason == "cut"]
 
 
 def _longest(gaps: list[LeftOut]) -> list[LeftOut]:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from personalize.media import read_frames
+from personalize.pictures import read_frames
 from personalize.quality import read_reasons
 from personalize.run import RunFolder, read_landmarks, read_track
 from tracker.albedo import Albedo, learn_albedo

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from personalize.media import VideoWriter, read_audio
+from personalize.sound import read_audio
 from personalize.talkers.motion import TalkerMotion, talker_motion
 from personalize.talkers.skin import backdrop, painted, seen_faces, skin_block, texture
 from personalize.talkers.style import Style
 from personalize.talkers.visemes import load_phones
+from personalize.video_writer import VideoWriter
 from tracker.head import HeadModel
 from tracker.raster import project, rasterize, shade
 

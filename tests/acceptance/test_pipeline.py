@@ -17,8 +17,9 @@ import pytest
 from model.checkpoint import Checkpoint
 from model.motion import Motion
 from personalize.demo import true_errors
-from personalize.media import read_audio, read_frames
+from personalize.pictures import read_frames
 from personalize.run import read_track
+from personalize.sound import read_audio
 from personalize.talkers.film import ASSETS, Truth, demo_identity, render_talker
 from personalize.talkers.motion import talker_motion
 from personalize.talkers.style import Style
@@ -28,7 +29,7 @@ from tracker.head import load_head
 SECONDS, FPS, SIDE = 12.0, 25.0, 320
 ITERATIONS = "60"
 STAGES = (
-    *("ingest", "landmarks", "camera", "track", "refine", "overlay"),
+    *("ingest", "landmarks", "camera", "track", "refine", "judge", "overlay"),
     *("registration", "finetune", "evaluate"),
 )
 
@@ -118,7 +119,7 @@ def content(out: Path) -> dict[str, str]:
 
 def test_killed_in_every_stage_it_ends_in_the_same_result(talk: Path, finished: Path) -> None:
     out = talk.with_name("killed")
-    folders = {"evaluate": "evaluation"}
+    folders = {"evaluate": "evaluation", "refine": "photometric", "judge": "refine"}
     for stage in STAGES:
         process = start(talk, out)
         partial = out / f".{folders.get(stage, stage)}.partial"
@@ -152,7 +153,7 @@ def test_animate_gives_motion_and_film(finished: Path, tmp_path: Path) -> None:
     speech = tmp_path / "speech.wav"
     command = [sys.executable, "-m", "cli.main", "animate"]
     sound, _ = read_audio(ASSETS / "demo_speech.flac")
-    from personalize.media import write_wav
+    from personalize.sound import write_wav
 
     write_wav(speech, sound[: 2 * 16000])
     subprocess.run(

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.films import film, shoot
 from benchmarks.ground_truth import GroundTruth
 from benchmarks.rendered_heads import Scene
-from personalize.media import read_frames
+from personalize.pictures import read_frames
 from tracker.head import HeadModel, load_head
 from tracker.landmarker import track_landmarks
 from tracker.raster import project

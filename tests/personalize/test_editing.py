@@ -16,8 +16,9 @@ from model.synthesis import synthesize
 from personalize import animation, editing
 from personalize.editing import EditSettings, edit_motion
 from personalize.errors import UserError
-from personalize.media import read_audio, read_frames, write_wav
+from personalize.pictures import read_frames
 from personalize.reporter import Reporter
+from personalize.sound import read_audio, write_wav
 from personalize.subject_data import BASE_CHECKPOINT, speech_features
 from personalize.talkers.film import ASSETS
 

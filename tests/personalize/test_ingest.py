@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from personalize.container import probe
 from personalize.errors import UserError
 from personalize.ingest import MIN_USABLE_S, find_usable, ingest_video
-from personalize.media import probe
 from personalize.people import Tracklet, main_person
 from personalize.shots import REASONS, Frames, difference, find_shots, usable_seconds
 from personalize.split import make_split

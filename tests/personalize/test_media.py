@@ -9,8 +9,11 @@ import av
 import numpy as np
 import pytest
 
+from personalize.container import probe
 from personalize.errors import UserError
-from personalize.media import VideoWriter, on_video_clock, probe, read_audio, read_frames, write_wav
+from personalize.pictures import read_frames
+from personalize.sound import on_video_clock, read_audio, write_wav
+from personalize.video_writer import VideoWriter
 from tests.personalize.video_factory import RATE, clicks, corner_picture, moving, write_video
 
 STEADY = [i / 25 for i in range(25)]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from personalize.errors import UserError
-from personalize.media import read_frames
 from personalize.overlay import COLUMNS, SPREAD, WORST, check_modes, notable_frames, write_overlay
+from personalize.pictures import read_frames
 from personalize.quality import write_quality
 from personalize.render.track import BAD, FOOTER, GOOD, PANEL, TILE, around_face, grid
 from personalize.run import RunFolder, write_landmarks, write_track
@@ -96,7 +96,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     track = dataclasses.replace(track, valid=valid, confidence=confidence)
     write_track(run.path / "refine/track.npz", track)
     reasons = ["ok" if used else "blurred" for used in valid]
-    write_quality(run.path / "refine/quality.csv", track, reasons)
+    write_quality(run.path / "refine/quality.csv", track, reasons, np.ones(len(track.time), np.float32))
     return run
 
 

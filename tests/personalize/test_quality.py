@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from personalize.evaluation.report import _apart
+from personalize.pipeline import STAGES
 from personalize.quality import frame_reasons, left_out, read_reasons, write_quality
 from personalize.shots import REASONS, Frames
 from tests.personalize.test_registration import track_of
@@ -44,9 +46,20 @@ def test_quality_csv_carries_the_reasons(frames, track, tmp_path: Path):
     assert [row["photometric"] for row in rows] == ["", "", "3.000", "1.500", "1.000", "0.500"]
 
 
+def test_another_threshold_judges_again_and_makes_nothing_else():
+    assert [stage.name for stage in STAGES if "min_confidence" in stage.reads] == ["judge"]
+
+
 def test_spans_end_where_the_next_frame_begins():
     reasons = np.array(["ok", "occluded", "occluded", "cut", "ok", "no_face"])
     spans = [(span.start_s, pytest.approx(span.end_s), span.reason) for span in left_out(TIME, reasons)]
     assert spans == [(0.04, 0.12, "occluded"), (0.12, 0.16, "cut"), (0.2, 0.24, "no_face")]
     assert left_out(TIME, np.array(["ok"] * 6)) == []
     assert left_out(TIME[:1], np.array(["cut"]))[0].end_s == 0
+
+
+def test_cuts_have_no_row_of_their_own_in_the_report():
+    spans = left_out(TIME, np.array(["ok", "occluded", "cut", "ok", "cut", "no_face"]))
+    told, cuts = _apart(spans)
+    assert [span.reason for span in told] == ["occluded", "no_face"]
+    assert sum(cut.end_s - cut.start_s for cut in cuts) == pytest.approx(0.08)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from personalize.media import read_frames
+from personalize.pictures import read_frames
 from personalize.talkers.film import ASSETS, DEMO_DISTANCE_M, Truth, demo_identity, render_talker
 from personalize.talkers.motion import FACING, talker_motion
 from personalize.talkers.style import Style

@@ -231,7 +231,7 @@ def test_the_stage_takes_the_place_of_three() -> None:
     assert [stage.name for stage in TRACKED_STAGES] == [
         stage.name for stage in STAGES if stage.name not in ("camera", "track")
     ]
-    assert output_paths(TRACKED_STAGES[2]) == ["refine/track.npz", "refine/quality.csv"]
+    assert output_paths(TRACKED_STAGES[2]) == output_paths(STAGES[4])
 
 
 def test_another_videos_tracking_is_refused(head: HeadModel, tmp_path: Path) -> None:

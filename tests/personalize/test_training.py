@@ -24,10 +24,10 @@ from model.trainer import TrainingDivergedError
 from model.training_config import TrainingConfig
 from personalize import protocol
 from personalize.errors import UserError
-from personalize.media import write_wav
 from personalize.mouth import mouth_regions
 from personalize.protocol import METRICS, SYSTEMS, Reference, first_seconds, with_noise
 from personalize.reporter import Reporter
+from personalize.sound import write_wav
 from personalize.training import read_faces
 from personalize.vocaset import TEST, TRAIN, VAL
 from tests.model import talker

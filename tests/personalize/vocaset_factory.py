@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from personalize.media import write_wav
+from personalize.sound import write_wav
 
 FPS = 60
 RATE = 22_000  # of raw_audio_fixed.pkl

@@ -37,6 +37,15 @@ def test_the_doubt_is_what_costs_most(track):
     assert (judged.confidence < 0.5).all() and (judged.confidence <= poor).all()
 
 
+def test_a_mouth_that_looks_other_than_usual_is_a_poor_fit(track):
+    clear = Appearance(np.zeros(4, np.float32), np.ones(4, np.float32))
+    deviation = np.float32([[1, 1], [1, 5], [2.9, 2.9], [np.nan, np.nan]])
+    judged, doubts = judge(track, clear, deviation)
+    expected = track.confidence * np.float32([1, np.exp(-2), 1, 1])
+    np.testing.assert_allclose(judged.confidence, expected, rtol=1e-6)
+    assert doubts[1] == "poor_fit"
+
+
 def turn(yaw_deg):
     turned = Rotation.from_euler("y", yaw_deg, degrees=True) * Rotation.from_rotvec(FACING)
     return turned.as_rotvec().astype(np.float32)

@@ -88,10 +88,14 @@ def test_view_reads_a_ramp_exactly_and_is_flat_outside():
     ramp = (3 * np.arange(40)[None, :] + 2 * np.arange(30)[:, None]).astype(np.float32)
     view = View(ramp[None], Window(np.array([[100.0, 50.0]]), 0.5, (40, 30)))
     inside, outside = [120.3, 71.7], [90.0, 60.0]
-    value, slope = view.read(np.array([[inside, outside]]))
+    depth = 2.0
+    points = [[depth * (x - 110) / 300, depth * (y - 60) / 300, depth] for x, y in (inside, outside)]
+    value, slope = view.read(np.array([points], np.float32), 300.0, np.array([110.0, 60.0]))
     place = (np.array(inside) - [100, 50] + 0.5) * 0.5 - 0.5
     np.testing.assert_allclose(value[0, 0], 3 * place[0] + 2 * place[1], rtol=1e-5)
-    np.testing.assert_allclose(slope[0], [[1.5, 1.0], [0.0, 0.0]], rtol=1e-5)
+    per_m = 300 / depth
+    along = -per_m / depth * (1.5 * points[0][0] + 1.0 * points[0][1])
+    np.testing.assert_allclose(slope[0], [[1.5 * per_m, per_m, along], [0, 0, 0]], rtol=1e-4)
 
 
 def test_window_cuts_what_lies_outside_as_its_border():
