@@ -329,11 +329,11 @@ def _eliminated(
     poses = blocks.reshape(6 * m, 6 * m)
 
     right = np.column_stack([cross.T, points_common, (points_slope + pull).reshape(-1)])
-    gone = np.linalg.inv(points * (1 + damping) + precision)
-    back = (gone @ right.reshape(q, 3, -1)).reshape(3 * q, -1)
+    gone: F64 = np.asarray(np.linalg.inv(points * (1 + damping) + precision), np.float64)
+    back: F64 = (gone @ right.reshape(q, 3, -1)).reshape(3 * q, -1)
     poses -= cross @ back[:, : 6 * m]
     rest = np.column_stack([poses_common, poses_slope]) - cross @ back[:, 6 * m :]
-    kept = np.linalg.solve(poses, rest)
+    kept: F64 = np.asarray(np.linalg.solve(poses, rest), np.float64)
     normal -= points_common.T @ back[:, 6 * m : -1] + rest[:, :-1].T @ kept[:, :-1]
     slope -= points_common.T @ back[:, -1] + rest[:, :-1].T @ kept[:, -1]
-    return normal, slope, (back, np.asarray(kept, np.float64))
+    return normal, slope, (back, kept)
