@@ -104,9 +104,7 @@ class _Studio:
             first += len(prop.vertices)
         self._faces = np.concatenate(parts).astype(np.int32)
         self._own = len(parts[0])
-        self._inside = np.setdiff1d(
-            np.concatenate([person.regions["mouth"], person.regions["teeth"]]), person.regions["lips"]
-        )
+        self._inside = _inside(person)
         self._albedo = np.concatenate(
             [_painted(person, scene), *(_prop_paint(prop, scene) for prop in self._props)]
         )
@@ -181,6 +179,11 @@ def _streak(moved: F64) -> F32:
     return kernel / kernel.sum()
 
 
+def _inside(person: HeadModel) -> NDArray[np.int32]:
+    """Vertices within the mouth."""
+    return np.concatenate([person.regions["mouth"], person.regions["teeth"], person.behind_lips()])
+
+
 def _prop_paint(prop: props.Prop, scene: Scene) -> F64:
     """[V, 3] one colour; a hand has the person's skin."""
     colour = np.array(HAND_COLOUR) * scene.skin if prop.moves else props.FRAME_COLOUR
@@ -191,8 +194,7 @@ def _painted(person: HeadModel, scene: Scene) -> F64:
     """[D, 3] the person's albedo: skin, hair, stubble."""
     albedo = painted(person).astype(np.float64)
     skin_parts = np.ones(len(albedo), bool)
-    skin_parts[np.concatenate([person.regions[name] for name in ("eyes", "teeth", "mouth")])] = False
-    skin_parts[person.regions["lips"]] = True
+    skin_parts[np.concatenate([person.regions["eyes"], _inside(person)])] = False
     albedo[skin_parts] *= scene.skin
     teeth = person.regions["teeth"]
     low = teeth[person.template[teeth, 1] < person.template[teeth, 1].mean()]

@@ -55,7 +55,8 @@ class Skin:
 def skin_of(head: HeadModel, model: LandmarkModel, identity: F32) -> Skin:
     """Points spread evenly over a subject's face; eyes, eyelids and the inside of the mouth are left out."""
     inside = np.concatenate([head.regions[name] for name in INSIDE if name in head.regions])
-    bare = np.setdiff1d(head.regions["face"], np.setdiff1d(inside, head.regions["lips"]))
+    inside = np.union1d(np.setdiff1d(inside, head.regions["lips"]), head.behind_lips())
+    bare = np.setdiff1d(head.regions["face"], inside)
     triangles = np.flatnonzero(np.isin(head.faces, bare).all(1))
     neutral = head.vertices(identity, np.zeros(len(head.expression_basis), np.float32))
     chosen, share = _spread(neutral[head.faces[triangles]])

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from tracker.skinning import Skeleton
@@ -116,6 +118,20 @@ class HeadModel:
         upper, lower = self.regions["inner_lip_upper"], self.regions["inner_lip_lower"]
         middle = len(upper) // 2
         return 1e3 * (vertices[..., upper[middle], 1] - vertices[..., lower[middle], 1])
+
+    def behind_lips(self) -> I32:
+        """[B] the lips' vertices behind the line where they meet: the mouth's inside. None of a head without one."""
+        lips, mouth = self.regions["lips"], self.regions["mouth"]
+        if not len(mouth):
+            return mouth
+        open_side = np.zeros(len(self.template), bool)
+        open_side[np.concatenate([lips, mouth])] = True
+        open_side[np.concatenate([self.regions["upper_lip_edge"], self.regions["lower_lip_edge"]])] = False
+        sides = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        sides = sides[open_side[sides].all(1)]
+        graph = coo_matrix((np.ones(len(sides)), sides.T), (len(open_side),) * 2)
+        part = connected_components(graph, directed=False)[1]
+        return lips[open_side[lips] & np.isin(part[lips], part[mouth])]
 
     def _positions(
         self,

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tracker.energy import LIP_PAIRS
 from tracker.head import ASSET, HeadModel, load_head, read_head
+from tracker.raster import rasterize
 from tracker.track import TrackError
 
 FLIP = np.array([-1, 1, 1], np.float32)
@@ -124,6 +125,18 @@ def test_lips_touch_on_every_neutral_face_and_open_with_the_jaw(head: HeadModel)
         for w in (0, 0.1, 0.3, 0.6, 1)
     ]
     assert (np.diff(opening) > 2).all() and 25 < opening[-1] < 45
+
+
+@pytest.mark.parametrize("jaw", [0.15, 0.4])
+def test_between_the_lips_an_open_mouth_shows_its_inside(head: HeadModel, jaw: float) -> None:
+    vertices = head.vertices(np.zeros(100), _weights(head, jawOpen=jaw))
+    px_per_m, height = 1e4, 1200
+    pixels = vertices * (px_per_m, -px_per_m, -1) + (2, 0, 1)
+    pixels[:, 1] += height / 2 - pixels[head.regions["inner_lip_upper"], 1].mean()
+    seen = rasterize(pixels, head.faces, (5, height)).triangle[:, 2]
+    inside = [head.regions[name] for name in ("mouth", "teeth", "tongue")]
+    shows = np.isin(head.faces[seen], np.concatenate([*inside, head.behind_lips()])).any(1)
+    assert 1e3 * shows.sum() / px_per_m == pytest.approx(head.lip_gap_mm(vertices), abs=0.3)
 
 
 @pytest.mark.parametrize(

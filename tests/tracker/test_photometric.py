@@ -129,6 +129,7 @@ def test_sample_points_lie_on_skin_alone():
     corners = np.unique(HEAD.faces[skin.triangles])
     for name in ("eyes", "teeth", "tongue"):
         assert not np.isin(corners, HEAD.regions[name]).any()
+    assert not np.isin(corners, HEAD.behind_lips()).any()
     assert np.isin(corners, HEAD.regions["lips"]).any()
     assert (skin.barycentric >= 0).all()
     np.testing.assert_allclose(skin.barycentric.sum(1), 1, rtol=1e-5)
