@@ -323,8 +323,8 @@ def test_progress_ends_at_its_total(talker):
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
-@pytest.mark.parametrize(("sd_log", "held"), [(0.08, True), (0.3, False)])
-def test_poses_are_the_bundles_where_it_tells_the_focal_length(talker, track, sd_log: float, held: bool):
+@pytest.mark.parametrize(("method", "held"), [("bundle", True), ("given", True), ("prior", False)])
+def test_poses_are_the_bundles_unless_the_focal_length_is_the_priors(talker, track, method, held: bool):
     frames = np.arange(0, 150, 3, dtype=np.int32)
     bundle = replace(
         NO_BUNDLE,
@@ -332,7 +332,7 @@ def test_poses_are_the_bundles_where_it_tells_the_focal_length(talker, track, sd
         rotation=Rotation.from_matrix(talker.rotation[frames]).as_rotvec().astype(np.float32),
         translation=talker.translation[frames].astype(np.float32),
     )
-    camera = replace(CAMERA, method="bundle", focal_sd_log=sd_log)
+    camera = replace(CAMERA, method=method)
     everything = np.ones(150, bool), np.zeros(150, np.int32)
     found = fit_track(talker.landmarks, camera, bundle, HEAD, *everything)
     swing, free = swing_deg(found, talker.rotation), swing_deg(track, talker.rotation)
