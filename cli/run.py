@@ -10,6 +10,8 @@ import typer
 
 from personalize.settings import Settings
 
+MOST_DISTORTION = 10.0  # that a lens has; also no infinity
+
 
 def run(
     video: Annotated[Path, typer.Argument(help="Video of one person talking: anything FFmpeg reads.")],
@@ -19,6 +21,13 @@ def run(
     iterations: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = Settings.iterations,
     seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = Settings.seed,
     focal: Annotated[float | None, typer.Option(min=1, help="Focal length in pixels, if known.")] = None,
+    distortion: Annotated[
+        str | None,
+        typer.Option(
+            metavar="K1[,K2[,K3]]",
+            help="The lens's radial distortion by OpenCV's model, if known; with --focal.",
+        ),
+    ] = None,
     base: Annotated[
         Path | None, typer.Option(help="Checkpoint to fine-tune; the embedded base model if not given.")
     ] = None,
@@ -63,6 +72,7 @@ def run(
         iterations=iterations,
         seed=seed,
         focal_px=focal,
+        distortion=coefficients(distortion, focal),
         device=device,
         base=_text(base),
         encoder=encoder,
@@ -78,6 +88,23 @@ def run(
     else:
         for name, path in result.items():
             typer.echo(f"{name:<11} {path}")
+
+
+def coefficients(distortion: str | None, focal: float | None) -> tuple[float, ...]:
+    """What --distortion says. Raises UserError where that are no one to three numbers, or they come without --focal."""
+    from personalize.errors import UserError
+
+    if distortion is None:
+        return ()
+    try:
+        numbers = tuple(float(number) for number in distortion.split(","))
+    except ValueError:
+        numbers = ()
+    if not 1 <= len(numbers) <= 3 or not all(abs(number) < MOST_DISTORTION for number in numbers):
+        raise UserError(f"--distortion {distortion}: give one to three small numbers, as in -0.21,0.05")
+    if focal is None:
+        raise UserError("--distortion needs --focal: both come from one calibration")
+    return numbers
 
 
 def _text(path: Path | None) -> str | None:

@@ -12,6 +12,7 @@ class Settings:
     iterations: fine-tuning steps (the paper: 30 000).
     seed: seed of every random draw.
     focal_px: focal length in pixels, None to estimate it.
+    distortion: radial coefficients k1, k2, k3 or fewer, of OpenCV's model; they go with `focal_px`.
     base: checkpoint that fine-tuning starts from, None for the embedded one.
     encoder: folder or hub name of the speech encoder that `base` was trained with, None for the embedded one.
     device: that fine-tuning runs on, `cpu` or `cuda`.
@@ -25,6 +26,7 @@ class Settings:
     iterations: int = 30_000
     seed: int = 0
     focal_px: float | None = None
+    distortion: tuple[float, ...] = ()
     base: str | None = None
     encoder: str | None = None
     device: str = "cpu"

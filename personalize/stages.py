@@ -89,7 +89,7 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 3, ("focal_px",)
+    name, version, reads = "camera", 3, ("focal_px", "distortion")
     needs = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz")
     makes = ("camera.json", "bundle.npz")
 
@@ -104,6 +104,7 @@ class CameraStage(Stage):
             lambda: read_frames(context.run.video),
             run_head(context.settings),
             focal_given=context.settings.focal_px,
+            distortion=context.settings.distortion,
             usable=frames.usable,
             segments=frames.segment,
             progress=context.report.progress,

@@ -39,6 +39,7 @@ def estimate_camera(
     frames: Callable[[], Iterable[Frame]],
     head: HeadModel,
     focal_given: float | None = None,
+    distortion: tuple[float, ...] = (),
     usable: NDArray[np.bool_] | None = None,
     segments: NDArray[np.int32] | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -46,14 +47,14 @@ def estimate_camera(
     """The camera of one clip and the rigid evidence for it, in the frame of the mean head.
 
     frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for each row of the landmarks. focal_given: px,
-    then nothing is estimated but poses and points.
+    then nothing is estimated but poses and points. distortion: its radial coefficients, see `Lens`.
     usable: [T] bool. segments: [T], number of the uninterrupted shot.
     """
     total = len(landmarks.time)
     usable = np.ones(total, bool) if usable is None else usable
     segments = np.zeros(total, np.int32) if segments is None else segments
-    prior = _camera(landmarks.size, focal_given)
-    tracks = track_features(frames(), landmarks, usable, segments, progress)
+    prior = _camera(landmarks.size, focal_given, distortion)
+    tracks = _straight(track_features(frames(), landmarks, usable, segments, progress), prior)
     start, surface = _start(tracks, landmarks, head, prior)
     if not len(start.observations):
         return prior, _bundle(start)
@@ -74,7 +75,13 @@ def _told(prior: Camera, scene: RigidScene, focal: float, sd_log: float) -> Came
     return replace(prior, focal_px=focal, focal_sd_log=sd_log, method="bundle")
 
 
-def _camera(size: tuple[int, int], focal_given: float | None) -> Camera:
+def _straight(tracks: FeatureTracks, camera: Camera) -> FeatureTracks:
+    """What was followed as a camera without distortion would see it."""
+    seen = camera.lens.points(tracks.observations[:, 2:])
+    return replace(tracks, observations=np.concatenate([tracks.observations[:, :2], seen], axis=1))
+
+
+def _camera(size: tuple[int, int], focal_given: float | None, distortion: tuple[float, ...]) -> Camera:
     """The camera before any evidence from the clip."""
     long_side = max(size)
     sentence = (
@@ -86,7 +93,7 @@ def _camera(size: tuple[int, int], focal_given: float | None) -> Camera:
         focal_px=float(focal_given or PRIOR_FOCAL * long_side),
         focal_sd_log=0.0 if focal_given else PRIOR_SD_LOG,
         principal_px=((size[0] - 1) / 2, (size[1] - 1) / 2),
-        distortion=(),
+        distortion=distortion,
         size=size,
         method="given" if focal_given else "prior",
         prior="none: the focal length was given" if focal_given else sentence,
@@ -113,7 +120,7 @@ def _start(
     rigid = rigid_landmarks(embedding)
     mean = np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis))
     surface = head.landmark_positions(*mean)[rigid].astype(np.float64)
-    xy = landmarks.points[tracks.frames][:, embedding.landmarks[rigid], :2].astype(np.float64)
+    xy = camera.lens.points(landmarks.points[tracks.frames][:, embedding.landmarks[rigid], :2])
     eyes = landmarks.points[tracks.frames][:, [RIGHT_EYE_OUTER, LEFT_EYE_OUTER], :2]
     errors = OUTLIER * np.linalg.norm(eyes[:, 0] - eyes[:, 1], axis=1)
     model = camera_model(camera.focal_px, camera.principal_px, camera.size)

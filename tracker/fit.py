@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import torch
 from kornia.geometry import axis_angle_to_rotation_matrix
@@ -64,7 +63,7 @@ def fit_track(
     weights = weights or Weights()
     model = landmark_model(head, weights)
     good = _measurable(landmarks, model, usable)
-    observed = _undistorted(landmarks.points[good][..., :2], camera)
+    observed = camera.lens.points(landmarks.points[good][..., :2])
     energy, start = _start(model, weights, camera, observed, landmarks.points[good])
     share = _share(evidence, good)
     sound = np.flatnonzero(share >= min(0.5, share.max()))
@@ -93,27 +92,6 @@ def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.b
             "clearly; give a clip in which one face is seen from the front"
         )
     return good
-
-
-def _undistorted(points: NDArray[np.floating], camera: Camera) -> F64:
-    """[n, 478, 2] px as a camera without distortion would see them."""
-    flat = points.astype(np.float64)
-    if not len(camera.distortion):
-        return flat
-    matrix, lens = _lens(camera)
-    return cv2.undistortPoints(flat.reshape(-1, 1, 2), matrix, lens, P=matrix).reshape(flat.shape)
-
-
-def undistorted_picture(rgb: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """A picture as a camera without distortion would see it."""
-    return cv2.undistort(rgb, *_lens(camera)) if len(camera.distortion) else rgb
-
-
-def _lens(camera: Camera) -> tuple[F64, F64]:
-    """OpenCV's camera matrix [3, 3] and distortion [5]."""
-    k1, k2, k3 = (*camera.distortion, 0.0, 0.0)[:3]
-    (cx, cy), f = camera.principal_px, camera.focal_px
-    return np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]]), np.array([k1, k2, 0.0, 0.0, k3])
 
 
 def _start(
@@ -212,7 +190,7 @@ def resume(
     model = landmark_model(head, weights)
     finite = np.isfinite(landmarks.points[:, model.landmarks]).all(axis=(1, 2))
     good = np.flatnonzero(track.valid & finite)
-    observed = _undistorted(landmarks.points[good][..., :2], camera)
+    observed = camera.lens.points(landmarks.points[good][..., :2])
     turn = torch.from_numpy(track.rotation[good].astype(np.float64))
     matrix = axis_angle_to_rotation_matrix(turn).numpy()
     rotation, translation = rotation_vector(matrix), track.translation[good] + matrix @ model.centre

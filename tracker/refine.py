@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.fit import make_track, resume, smoothness_between, undistorted_picture
+from tracker.fit import make_track, resume, smoothness_between
 from tracker.skin_fit import Photometry, Subject, fit_stretch, learn_levels
 from tracker.track import F32, F64, Camera, Landmarks, Track
 from tracker.view import U8, Index
@@ -102,7 +102,7 @@ def _cuts(
     row_of = dict(zip(wanted.tolist(), rows.tolist()))
     for frame, (_, rgb) in enumerate(frames):
         if frame in row_of:
-            yield row_of[frame], subject.window.cut(undistorted_picture(rgb, camera), row_of[frame])
+            yield row_of[frame], subject.window.cut(camera.lens.picture(rgb), row_of[frame])
 
 
 def _stretches(cuts: Iterable[tuple[int, U8]], total: int) -> Iterator[tuple[int, dict[int, U8]]]:

@@ -31,7 +31,7 @@ class Photometry:
     least_blur_px: float = 1.0
     """No blur is smaller than this in the pictures worked on."""
     finest_px_per_m: float = 1600.0
-    """Pictures of larger faces are shrunk to this: the finest blur is a pixel of it, and errors stay the same."""
+    """Pictures of larger faces are shrunk to this: the finest blur is a pixel of it."""
     evidence: float = 0.1
     """Share of the points that err independently; neighbours err together."""
     robust: float = 2.5

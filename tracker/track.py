@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tracker.lens import Lens
+
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
@@ -51,6 +53,11 @@ class Camera:
     size: tuple[int, int]
     method: str
     prior: str
+
+    @property
+    def lens(self) -> Lens:
+        """What takes the distortion out of its pictures."""
+        return Lens(self.focal_px, self.principal_px, self.distortion)
 
 
 @dataclass(frozen=True)
@@ -97,3 +104,9 @@ class Track:
     head: str
     lip_gap_mm: F32
     reprojection_px: F32
+
+    @property
+    def lens(self) -> Lens:
+        """What takes the distortion out of its camera's pictures."""
+        x, y = self.principal.tolist()
+        return Lens(self.focal, (x, y), tuple(self.distortion.tolist()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -35,6 +35,7 @@ U8 = NDArray[np.uint8]
 class TrackPictures:
     """Draws any frame of a run: its track, in which modes, on which part of the picture.
 
+    landmarks: without the camera's distortion, which is taken out of the pictures too.
     reasons: [T] why each frame is left out, `ok` where it is not.
     """
 
@@ -51,6 +52,8 @@ class TrackPictures:
         """Read the run's track; learn the subject's albedo where one of the modes needs it."""
         track = read_track(run.path / "refine/track.npz")
         landmarks = read_landmarks(run.path / "landmarks/landmarks.npz")
+        seen = track.lens.points(landmarks.points[..., :2]).astype(np.float32)
+        landmarks = replace(landmarks, points=np.concatenate([seen, landmarks.points[..., 2:]], axis=-1))
         reasons = read_reasons(run.path / "refine/quality.csv").tolist()
         valid = np.flatnonzero(track.valid)
         crop = around_face(landmarks.points[valid, :, :2], landmarks.size)
@@ -58,7 +61,7 @@ class TrackPictures:
         if any(mode in NEEDS_ALBEDO for mode in modes):
             keys = set(valid[np.linspace(0, len(valid) - 1, KEYS).round().astype(int)].tolist())
             albedo = learn_albedo(
-                scene(rgb, crop, track, frame, landmarks, head)
+                scene(track.lens.picture(rgb), crop, track, frame, landmarks, head)
                 for frame, (_, rgb) in enumerate(read_frames(run.video))
                 if frame in keys
             )
@@ -78,6 +81,7 @@ class TrackPictures:
 
     def film(self, rgb: U8, frame: int) -> U8:
         """The film's picture: the video and each mode, below them time and confidence."""
+        rgb = self.track.lens.picture(rgb)
         panels = [self.crop.picture(rgb), *self._drawn(rgb, frame, self.crop, self.modes)]
         for panel, name in zip(panels, ("video", *self.modes)):
             letter(panel, name, (LETTERS, 2 * LETTERS), LETTERS)
@@ -85,6 +89,7 @@ class TrackPictures:
 
     def tile(self, rgb: U8, frame: int) -> U8:
         """A square around the face of a tracked frame in the first mode: on it a wrong mesh can be seen."""
+        rgb = self.track.lens.picture(rgb)
         points = project(place(self.track, frame, self.head)[1], self.track.focal, self.track.principal)
         low, high = points.min(0), points.max(0)
         side = round(float((high - low).max()) * (1 + 2 * TILE_MARGIN))

@@ -70,6 +70,8 @@ def test_an_encoder_a_device_or_a_mode_that_is_not_there_gets_one_line_before_an
     speech.touch()
     assert_refused(personalize("run", video, "--encoder", "nowhere", cwd=tmp_path), "nowhere")
     assert_refused(personalize("run", video, "--device", "abacus", cwd=tmp_path), "abacus", "cpu")
+    assert_refused(personalize("run", video, "--distortion", "-0.2", cwd=tmp_path), "--distortion", "--focal")
+    assert_refused(personalize("run", video, "--distortion", "-0.2,much", cwd=tmp_path), "-0.2,much")
     assert_refused(personalize("run", video, "--overlay", "shaded,wire", cwd=tmp_path), "wire:", "wireframe")
     subject = ("--subject", BASE_CHECKPOINT)
     assert_refused(personalize("animate", speech, *subject, "--encoder", "nowhere", cwd=tmp_path), "nowhere")

@@ -11,7 +11,7 @@ from personalize.errors import UserError
 from personalize.overlay import COLUMNS, SPREAD, WORST, check_modes, notable_frames, write_overlay
 from personalize.pictures import read_frames
 from personalize.quality import write_quality
-from personalize.render.track import BAD, FOOTER, GOOD, PANEL, TILE, around_face, grid
+from personalize.render.track import BAD, FOOTER, GOOD, PANEL, TILE, TrackPictures, around_face, grid
 from personalize.run import RunFolder, write_landmarks, write_track
 from personalize.settings import Settings
 from personalize.stages import Overlay
@@ -130,3 +130,13 @@ def test_the_same_film_is_made_twice(run: RunFolder, tmp_path: Path) -> None:
     first, second = (make(run, tmp_path / name, ("wireframe", "error")) for name in ("first", "second"))
     for name in ("overlay.mp4", "preview.mp4", "contact_sheet.png"):
         assert (first / name).read_bytes() == (second / name).read_bytes()
+
+
+def test_the_lens_is_taken_out_of_what_is_shown(run: RunFolder) -> None:
+    pictures = TrackPictures.of(run, load_head(), ("landmarks",))
+    bent = dataclasses.replace(pictures.track, distortion=np.array([-0.5], np.float32))
+    rgb = np.random.default_rng(0).integers(0, 255, (*pictures.landmarks.size[::-1], 3)).astype(np.uint8)
+    width, height = pictures.crop.size
+    shown = dataclasses.replace(pictures, track=bent).film(rgb, LEFT_OUT)[60:height, :width]
+    expected = pictures.crop.picture(bent.lens.picture(rgb))[60:height]
+    assert (shown == expected).mean() > 0.99 and (shown == pictures.crop.picture(rgb)[60:height]).mean() < 0.5

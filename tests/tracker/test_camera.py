@@ -1,5 +1,7 @@
 """Focal length, poses and rigid points from tracks on a head that the mean head is not."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -108,6 +110,30 @@ def test_a_still_head_leaves_the_prior(head: HeadModel, monkeypatch: pytest.Monk
     assert "832 px" in camera.prior
     assert len(bundle.frame) == len(marks.time) and np.isfinite(bundle.points).all()
     assert (bundle.translation[:, 2] > 0.2).all() and (bundle.translation[:, 2] < 1).all()
+
+
+def test_a_given_lens_is_taken_out(head: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    marks, tracks, _ = _talk(head, 15)
+    _given(tracks, monkeypatch)
+    _, straight = estimate_camera(marks, lambda: [], head, focal_given=FOCAL)
+    k1 = -0.4
+    points, seen = marks.points.copy(), tracks.observations.copy()
+    points[..., :2], seen[:, 2:] = _bent(points[..., :2], k1), _bent(seen[:, 2:], k1)
+    assert np.abs(points - marks.points).max() > 1.5
+    _given(replace(tracks, observations=seen), monkeypatch)
+    camera, bundle = estimate_camera(
+        replace(marks, points=points), lambda: [], head, focal_given=FOCAL, distortion=(k1,)
+    )
+    assert camera.distortion == (k1,)
+    between = Rotation.from_rotvec(straight.rotation).inv() * Rotation.from_rotvec(bundle.rotation)
+    assert np.degrees(between.magnitude().max()) < 0.05
+    np.testing.assert_allclose(bundle.observations, straight.observations, atol=0.02)
+
+
+def _bent(xy: np.ndarray, k1: float) -> np.ndarray:
+    """Where a lens shows what a pinhole would show at xy [..., 2] px."""
+    from_centre = (xy - CENTRE) / FOCAL
+    return CENTRE + FOCAL * from_centre * (1 + k1 * (from_centre**2).sum(-1, keepdims=True))
 
 
 def test_a_given_focal_length_is_kept(head: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:

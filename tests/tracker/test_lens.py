@@ -1,0 +1,47 @@
+"""A lens against OpenCV's own projection."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from tracker.lens import Lens
+
+FOCAL, PRINCIPAL = 500.0, (319.5, 239.5)
+MATRIX = np.array([[FOCAL, 0, PRINCIPAL[0]], [0, FOCAL, PRINCIPAL[1]], [0, 0, 1]])
+
+
+def seen(points: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """[n, 2] px, where a lens shows what a pinhole would show at `points`."""
+    rays = np.concatenate([(points - PRINCIPAL) / FOCAL, np.ones((len(points), 1))], axis=1)
+    k1, k2, k3 = (*distortion, 0.0, 0.0)[:3]
+    bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), MATRIX, np.array([k1, k2, 0, 0, k3]))
+    return bent.reshape(-1, 2)
+
+
+@pytest.mark.parametrize("distortion", [(-0.2,), (-0.2, 0.05), (0.1, 0.0, -0.02)])
+def test_points_come_back_to_where_a_pinhole_shows_them(distortion: tuple[float, ...]) -> None:
+    straight = np.random.default_rng(0).uniform((60, 60), (580, 420), (40, 2))
+    bent = seen(straight, distortion)
+    assert np.abs(bent - straight).max() > 2
+    back = Lens(FOCAL, PRINCIPAL, distortion).points(bent.reshape(8, 5, 2))
+    np.testing.assert_allclose(back, straight.reshape(8, 5, 2), atol=0.02)
+
+
+def test_a_picture_moves_as_its_points_do() -> None:
+    lens = Lens(FOCAL, PRINCIPAL, (-0.25,))
+    for dot in [(120.0, 100.0), (500.0, 400.0)]:
+        picture = np.zeros((480, 640, 3), np.uint8)
+        cv2.circle(picture, (int(dot[0]), int(dot[1])), 6, (255, 255, 255), -1)
+        mass = lens.picture(picture)[..., 0].astype(np.float64)
+        rows, columns = np.mgrid[:480, :640]
+        centre = np.array([(columns * mass).sum(), (rows * mass).sum()]) / mass.sum()
+        np.testing.assert_allclose(centre, lens.points(np.array(dot)), atol=0.4)
+
+
+def test_a_pinhole_changes_nothing() -> None:
+    lens = Lens(FOCAL, PRINCIPAL, ())
+    picture, points = np.full((4, 5, 3), 7, np.uint8), np.array([[1.25, np.nan]], np.float32)
+    assert lens.picture(picture) is picture
+    np.testing.assert_array_equal(lens.points(points), points)
