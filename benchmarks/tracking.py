@@ -104,7 +104,8 @@ def stages(clip: Clip, head: HeadModel) -> Iterator[tuple[str, Track, float]]:
     if (video := clip.video) is not None:
         start = time.process_time()
         refined = refine_track(
-            *(track, landmarks, camera, head, clip.segment, lambda: read_frames(video)), evidence=evidence
+            *(track, landmarks, camera, clip.bundle, head, clip.segment, lambda: read_frames(video)),
+            evidence=evidence,
         )
         spent += 1e3 * (time.process_time() - start) / count
         yield "refined", judged(refined.track, clip, refined.deviation), spent

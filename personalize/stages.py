@@ -143,7 +143,7 @@ class TrackStage(Stage):
 class Refine(Stage):
     """The track again, with the grey levels of the skin."""
 
-    name, folder, version = "refine", "photometric", 3
+    name, folder, version = "refine", "photometric", 4
     needs = (
         *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),
@@ -158,7 +158,7 @@ class Refine(Stage):
         refined = refine_track(
             files.read_track(root / "track/track.npz"),
             files.read_landmarks(root / "landmarks/landmarks.npz"),
-            files.read_camera(root / "camera")[0],
+            *files.read_camera(root / "camera"),
             run_head(context.settings),
             files.read_frames(root / "ingest/frames.npz").segment,
             lambda: read_frames(context.run.video),
@@ -171,7 +171,7 @@ class Refine(Stage):
 class ReadTracked(Stage):
     """Another tracker's result in the place of ours: camera, track and refine in one."""
 
-    name, folder, version = "refine", "photometric", 3
+    name, folder, version = "refine", "photometric", 4
     needs = ("ingest/frames.npz", "landmarks/landmarks.npz")
     makes = Refine.makes
 

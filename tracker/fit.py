@@ -74,7 +74,7 @@ def fit_track(
     smoothness = smoothness_between(energy, landmarks.time, good, segment)
     x, _ = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
     if camera.method != "prior":
-        x = hold_poses(x, bundle, good, _runs(good, segment))
+        x = hold_poses(x, bundle, good, runs(good, segment))
     return make_track(landmarks, camera, head, energy, observed, identity, x, good)
 
 
@@ -161,7 +161,7 @@ def fit_identity(energy: Energy, start: F64, keys: tuple[Frames, Frames]) -> F64
     return solve_subject(chosen, np.zeros(len(energy.model.identity)), start[frames]).identity
 
 
-def _runs(good: Frames, segment: NDArray[np.int32]) -> NDArray[np.int64]:
+def runs(good: Frames, segment: NDArray[np.int32]) -> NDArray[np.int64]:
     """[n] a number for each stretch of measured frames that follow each other within one shot."""
     broken = (np.diff(good) != 1) | (np.diff(segment[good]) != 0)
     return np.concatenate([[0], np.cumsum(broken)])
@@ -176,7 +176,7 @@ def smoothness_between(
     sd = np.repeat(energy.weights.acceleration, (energy.model.expressions, 3, 3))
     # The integral of white noise bends by the power 1.5 of the interval.
     precision = factor / (sd * (interval / 0.04) ** 1.5) ** 2
-    return Smoothness.between(_runs(good, segment), precision)
+    return Smoothness.between(runs(good, segment), precision)
 
 
 def resume(

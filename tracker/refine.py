@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.fit import make_track, resume, smoothness_between
+from tracker.fit import make_track, resume, runs, smoothness_between
+from tracker.rigid_pose import hold_poses
 from tracker.skin_fit import Photometry, Subject, fit_stretch, learn_levels
-from tracker.track import F32, F64, Camera, Landmarks, Track
+from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
 from tracker.view import U8, Index
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ def refine_track(
     track: Track,
     landmarks: Landmarks,
     camera: Camera,
+    bundle: Bundle,
     head: HeadModel,
     segment: NDArray[np.int32],
     frames: Callable[[], Iterable[Frame]],
@@ -50,7 +52,8 @@ def refine_track(
 
     segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
     each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
-    look like keeps its landmark fit, and so does one whose picture is missing. evidence: see `fit_track`.
+    look like keeps its landmark fit, and so does one whose picture is missing. bundle, evidence: see `fit_track`; the
+    grey levels tell rotation less well than the bundle, so its poses are taken again.
     What it gains is printed by `python -m benchmarks tracking`: pose and jitter mostly; the lips' openings are left
     to the landmarks, see `Photometry.pair_noise_mm`.
     """
@@ -77,6 +80,8 @@ def refine_track(
         deviation[rows[own]] = np.where(better[:, None], after, before)[own]
         if progress:
             progress(min(start + STRETCH, len(good)), len(good))
+    if camera.method != "prior":
+        refined = hold_poses(refined, bundle, good, runs(good, segment))
     out = make_track(
         landmarks, camera, head, energy, observed, track.identity.astype(np.float64), refined, good
     )

@@ -39,17 +39,18 @@ class Film:
     pictures: list[np.ndarray]
     landmarks: Landmarks
     rotation: np.ndarray
+    translation: np.ndarray
     gap: np.ndarray
     track: Track
 
     def frames(self):
         return iter([(n / 25, picture) for n, picture in enumerate(self.pictures)])
 
-    def refine(self, pictures=None, landmarks=None, track=None):
+    def refine(self, pictures=None, landmarks=None, track=None, bundle=NO_BUNDLE):
         film = replace(self, pictures=self.pictures if pictures is None else pictures)
         segment = np.zeros(len(self.landmarks.time), np.int32)
         return refine_track(
-            track or self.track, landmarks or self.landmarks, CAMERA, HEAD, segment, film.frames
+            track or self.track, landmarks or self.landmarks, CAMERA, bundle, HEAD, segment, film.frames
         )
 
 
@@ -82,7 +83,7 @@ def film() -> Film:
     landmarks = Landmarks(t, points, np.ones(FRAMES, np.float32), scores, BLENDSHAPE_NAMES, SIZE)
     usable, segment = np.ones(FRAMES, bool), np.zeros(FRAMES, np.int32)
     track = fit_track(landmarks, CAMERA, NO_BUNDLE, HEAD, usable, segment)
-    return Film(noisy, landmarks, rotation, np.asarray(HEAD.lip_gap_mm(vertices)), track)
+    return Film(noisy, landmarks, rotation, translation, np.asarray(HEAD.lip_gap_mm(vertices)), track)
 
 
 def turn_error_deg(track: Track, truth: np.ndarray) -> float:
@@ -109,6 +110,17 @@ def test_pictures_lower_the_error(film: Film):
     assert opening_error_mm(refined.track, film.gap) < 1.01 * opening_error_mm(film.track, film.gap)
     np.testing.assert_array_equal(refined.track.identity, film.track.identity)
     assert np.nanmedian(refined.deviation[:, 0]) == pytest.approx(1, abs=1e-5)
+
+
+def test_the_bundles_poses_are_kept_where_it_has_them(film: Film):
+    frames = np.arange(0, FRAMES, 3, dtype=np.int32)
+    rotation = Rotation.from_matrix(film.rotation[frames]).as_rotvec().astype(np.float32)
+    bundle = replace(
+        NO_BUNDLE, frame=frames, rotation=rotation, translation=film.translation[frames].astype(np.float32)
+    )
+    free, held = film.refine().track, film.refine(bundle=bundle).track
+    assert turn_error_deg(held, film.rotation) < 0.6 * turn_error_deg(free, film.rotation)
+    np.testing.assert_array_equal(held.expression, free.expression)
 
 
 def test_a_covered_mouth_loses_confidence(film: Film):
@@ -140,7 +152,8 @@ def test_one_frame(film: Film):
     fields += ("lip_gap_mm", "reprojection_px")
     track = replace(film.track, **{name: getattr(film.track, name)[one] for name in fields})
     refined = refine_track(
-        track, landmarks, CAMERA, HEAD, np.zeros(1, np.int32), lambda: iter([(0.0, film.pictures[0])])
+        *(track, landmarks, CAMERA, NO_BUNDLE, HEAD, np.zeros(1, np.int32)),
+        lambda: iter([(0.0, film.pictures[0])]),
     )
     assert np.isfinite(refined.track.expression).all()
     assert refined.deviation.shape == (1, 2)
