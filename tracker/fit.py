@@ -65,8 +65,7 @@ def fit_track(
     good = _measurable(landmarks, model, usable)
     observed = camera.lens.points(landmarks.points[good][..., :2])
     energy, start = _start(model, weights, camera, observed, landmarks.points[good])
-    share = _share(evidence, good)
-    sound = np.flatnonzero(share >= min(0.5, share.max()))
+    share, sound = _share(evidence, good), trusted(evidence, good)
     rest, other = (sound[rows] for rows in key_frames(observed[sound], energy.px_per_m[sound]))
     energy = with_lips_shut(energy, start, rest)
     identity = fit_identity(energy, start, (rest, other))
@@ -74,13 +73,19 @@ def fit_track(
     smoothness = smoothness_between(energy, landmarks.time, good, segment)
     x, _ = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
     if camera.method != "prior":
-        x = hold_poses(x, bundle, good, runs(good, segment))
+        x = hold_poses(x, bundle, good, runs(good, segment), sound)
     return make_track(landmarks, camera, head, energy, observed, identity, x, good)
 
 
 def _share(evidence: F32 | None, good: Frames) -> F64:
     """[n] how far the landmarks of the frames `good` are followed."""
     return np.ones(len(good)) if evidence is None else np.maximum(evidence[good], LEAST_EVIDENCE)
+
+
+def trusted(evidence: F32 | None, good: Frames) -> Frames:
+    """Rows of the frames `good` [n] that tell something on their own; see `fit_track`."""
+    share = _share(evidence, good)
+    return np.flatnonzero(share >= min(0.5, share.max()))
 
 
 def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.bool_]) -> Frames:

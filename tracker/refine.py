@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.fit import make_track, resume, runs, smoothness_between
+from tracker.fit import make_track, resume, runs, smoothness_between, trusted
 from tracker.rigid_pose import hold_poses
 from tracker.skin_fit import Photometry, Subject, fit_stretch, learn_levels
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
@@ -81,7 +81,7 @@ def refine_track(
         if progress:
             progress(min(start + STRETCH, len(good)), len(good))
     if camera.method != "prior":
-        refined = hold_poses(refined, bundle, good, runs(good, segment))
+        refined = hold_poses(refined, bundle, good, runs(good, segment), trusted(evidence, good))
     out = make_track(
         landmarks, camera, head, energy, observed, track.identity.astype(np.float64), refined, good
     )

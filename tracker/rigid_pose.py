@@ -22,15 +22,17 @@ MIN_FRAMES = 8  # of a window: fewer do not tell how the two head frames lie to 
 # Of the turn between the two poses in a window. On all heads whose truth is known 95 % are below 2.3 degrees, and are
 # the landmarks' error; beyond it brows move, and what the tracks follow is not one rigid body.
 PLAUSIBLE, PLAUSIBLE_QUANTILE = np.radians(2.5), 0.95
+CERTAIN = np.array([[1.0], [1.0], [0.1]])  # of a landmark pose's place: depth is seen ten times less well
 FADE = 12  # frames beyond the end of a window over which its correction fades
 
 
-def hold_poses(x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64]) -> F64:
+def hold_poses(x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], sound: Rows) -> F64:
     """The unknowns x [n, P] of the frames good [n] with their poses moved onto the bundle's.
 
     run: [n], frames of one number follow each other without a break; nothing is carried from one to another.
+    sound: rows of x whose poses tell how the two head frames lie to each other, and where the difference is known.
     """
-    known = np.isin(bundle.frame, good)
+    known = np.isin(bundle.frame, good[sound])
     row = np.searchsorted(good, bundle.frame[known])
     rotation = Rotation.from_rotvec(bundle.rotation[known]).as_matrix()
     translation = bundle.translation[known].astype(np.float64)
@@ -62,8 +64,9 @@ def _corrections(x: F64, rotation: F64, translation: F64) -> F64:
     u, _, vt = np.linalg.svd((own.transpose(0, 2, 1) @ rotation).mean(0))
     target = rotation @ (u @ vt).T
     # The model's centre stands still in the bundle's frame, whose scale is its own: place = rotation c + s translation.
-    system = np.concatenate([rotation, translation[..., None]], axis=2).reshape(-1, 4)
-    moved = (system @ np.linalg.lstsq(system, place.reshape(-1), rcond=None)[0]).reshape(-1, 3)
+    system = np.concatenate([rotation, translation[..., None]], axis=2)
+    told = np.linalg.lstsq((CERTAIN * system).reshape(-1, 4), (CERTAIN[:, 0] * place).reshape(-1), rcond=None)
+    moved = system @ told[0]
     turn = Rotation.from_matrix(target @ own.transpose(0, 2, 1)).as_rotvec()
     change = np.concatenate([turn, moved - place], axis=1)
     # Landmarks drift slowly; what changes from one known frame to the next is noise of either.
