@@ -24,7 +24,7 @@ from tracker.track import F64, Bundle, Camera, Landmarks
 PRIOR_FOCAL = 1.3  # of the picture's long side: phones and webcams .7-1.2, camcorders and portraits 1.2-2.5
 PRIOR_SD_LOG = 0.35
 FOCAL_RANGE = (0.6, 5.0)  # of the long side
-LEAST_SD_LOG = 0.05  # of log(focal): what light and skin that moves do to all tracks alike
+LEAST_SD_LOG = 0.08  # of log(focal): what light and skin that moves do to all tracks alike
 TOLD = 0.8  # of the prior's uncertainty: a clip that leaves more of it has told nothing
 MIN_TURN_DEG = 8.0  # a head that turns less leaves focal length and depth undecided
 # Of the distance between the outer eye corners: farther landmarks do not count for a frame's pose.
