@@ -95,7 +95,7 @@ def test_view_reads_a_ramp_exactly_and_is_flat_outside():
     np.testing.assert_allclose(value[0, 0], 3 * place[0] + 2 * place[1], rtol=1e-5)
     per_m = 300 / depth
     along = -per_m / depth * (1.5 * points[0][0] + 1.0 * points[0][1])
-    np.testing.assert_allclose(slope[0], [[1.5 * per_m, per_m, along], [0, 0, 0]], rtol=1e-4)
+    np.testing.assert_allclose(slope[0], [[1.5 * per_m, per_m, along], [0, 0, 0]], rtol=1e-5)
 
 
 def test_window_cuts_what_lies_outside_as_its_border():
