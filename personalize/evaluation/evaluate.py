@@ -26,7 +26,6 @@ F32 = NDArray[np.float32]
 SYSTEMS = ("mean_motion", "ridge", "base", "personalized")
 SAMPLES = 10
 LONGEST_CLIP_S = 12.0
-AV_MARGIN_S = 0.3
 
 
 @dataclass(frozen=True)
