@@ -28,7 +28,7 @@ from model.checkpoint import Checkpoint
 from model.dataset import Sequence
 from model.diffusion import STEPS
 from model.finetuning import EARLY_TOLERANCE, SWEEP, choose_checkpoint, subject_of
-from model.metrics import lip_gap_r, lip_opening_mm, score
+from model.metrics import eyelid_opening_mm, lip_gap_r, lip_opening_mm, score
 from model.ridge import Ridge
 from model.speech import load_encoder
 from model.synthesis import synthesize
@@ -36,7 +36,6 @@ from model.trainer import Trainer
 from model.training_config import TrainingConfig
 from personalize.run import RunFolder
 from personalize.subject_data import BASE_CHECKPOINT, load_subject_data
-from tracker.head import load_head
 
 F32 = NDArray[np.float32]
 SIGNALS = ("lips", "width", "lids")
@@ -46,21 +45,12 @@ CURVE_SAMPLES = 4
 
 def signals(checkpoint: Checkpoint, coefficients: F32) -> dict[str, F32]:
     """Lip opening, mouth width and mean eyelid opening, mm, of coefficients [..., N, K] m: [..., N] each."""
-    regions = load_head().regions
     mesh = checkpoint.template, checkpoint.basis, checkpoint.regions
-
-    def between(one: int, other: int, axis: int) -> F32:
-        motion = checkpoint.basis[:, one, axis] - checkpoint.basis[:, other, axis]
-        return 1000 * (coefficients @ motion)
-
-    corners, lids = regions["inner_lip_upper"], []
-    for side in ("left", "right"):
-        upper, lower = (regions[f"{side}_eyelid_{part}"] for part in ("upper", "lower"))
-        lids.append(between(int(upper[len(upper) // 2]), int(lower[len(lower) // 2]), 1))
+    left, right = checkpoint.basis[:, checkpoint.regions["inner_lip_upper"][[0, -1]], 0].T
     return {
         "lips": lip_opening_mm(*mesh, coefficients),
-        "width": np.abs(between(int(corners[0]), int(corners[-1]), 0)),
-        "lids": (lids[0] + lids[1]) / 2,
+        "width": np.abs(1000 * (coefficients @ (left - right))),
+        "lids": eyelid_opening_mm(*mesh, coefficients),
     }
 
 

@@ -17,10 +17,6 @@ from model.errors import ModelError
 # A coefficient that hardly moves is not blown up to unit variance: its scale is at least this share of the
 # largest.
 SMALLEST_SCALE = 0.01
-# A coefficient that is mostly still and seldom jumps (an eyelid) is scaled so that it hardly ever exceeds this value.
-# In standard deviations a blink may be 10: whether there is one would be decided by steps whose noise leaves nothing
-# else to see, and the model forgets to blink (docs/method.md).
-LARGEST_VALUE, LARGEST_QUANTILE = 4.0, 0.999
 
 
 @dataclass(frozen=True)
@@ -71,8 +67,7 @@ class Standardization:
         mean, sd, audio_scale = motion.mean(axis=0), motion.std(axis=0), audio.std(axis=0)
         if sd.max() <= 0:
             raise ModelError("the motion does not move at all: there is nothing to learn from")
-        largest = np.quantile(np.abs(motion - mean), LARGEST_QUANTILE, axis=0)
-        scale = np.maximum(np.maximum(sd, largest / LARGEST_VALUE), SMALLEST_SCALE * sd.max())
+        scale = np.maximum(sd, SMALLEST_SCALE * sd.max())
         return cls(
             mean=mean.astype(np.float32),
             scale=scale.astype(np.float32),
@@ -116,8 +111,10 @@ class Crops:
         standardization: Standardization,
         length: int,
         device: str | torch.device = "cpu",
+        blinks: NDArray[np.float32] | None = None,
     ) -> None:
-        """device: that batches are made on. Raises ModelError where no run of valid frames is long enough."""
+        """device: that batches are made on. blinks: [S, N, K] m by style, of which each crop gets some moment's added
+        (`model.blinks`). Raises ModelError where no run of valid frames is long enough."""
         starts, offset = [], 0
         for sequence in sequences:
             runs = np.convolve(sequence.valid, np.ones(length, dtype=int), mode="full")[length - 1 :]
@@ -133,6 +130,9 @@ class Crops:
         style = torch.from_numpy(np.concatenate([np.full(len(s.valid), s.style) for s in sequences]))
         self._motion, self._audio, self._style = motion.to(device), audio.to(device), style.to(device)
         self._within = torch.arange(length)[:, None]
+        self._blinks = None
+        if blinks is not None:
+            self._blinks = torch.from_numpy(blinks / standardization.scale).to(device)
 
     def __len__(self) -> int:
         return len(self._starts)
@@ -141,4 +141,9 @@ class Crops:
         """`count` random crops."""
         first = self._starts[torch.randint(len(self._starts), (count,), generator=generator)]
         index = (first + self._within).to(self._motion.device)
-        return Batch(self._motion[index], self._audio[index], self._style[index[0]])
+        motion, style = self._motion[index], self._style[index[0]]
+        if self._blinks is not None:
+            last = self._blinks.shape[1] - len(self._within)
+            moment = torch.randint(last + 1, (count,), generator=generator) + self._within
+            motion = motion + self._blinks[style, moment.to(motion.device)]
+        return Batch(motion, self._audio[index], style)

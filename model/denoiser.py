@@ -100,6 +100,12 @@ class Denoiser(nn.Module, ABC):
         >= MIN_FRAMES.
         """
 
+    def moving_parameters(self) -> list[nn.Parameter]:
+        """All but those through which the speech passes on its way to the motion."""
+        hearing = ("audio", "speech")
+        named = self.named_parameters()
+        return [value for name, value in named if not any(part in name for part in hearing)]
+
     def encode(self, x: Tensor, steps: Tensor) -> Tensor:
         """Motion [N, *b, K] and its diffusion step -> [N, *b, C]."""
         return F.silu(self.encoder(x)) + self.step(sinusoidal(steps, self.config.channels).to(x.dtype))

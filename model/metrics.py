@@ -20,6 +20,9 @@ from model.errors import ModelError
 F32 = NDArray[np.float32]
 Regions = Mapping[str, NDArray[np.int32]]
 
+# The rims of the lids, each from corner to corner, of both eyes.
+EYELIDS = tuple((f"{side}_eyelid_upper", f"{side}_eyelid_lower") for side in ("left", "right"))
+INNER_LIPS = ("inner_lip_upper", "inner_lip_lower")
 # Lips count as closed below this opening.
 CLOSED_MM = 0.5
 # A closure may come this much early or late.
@@ -57,8 +60,18 @@ def lip_opening_mm(template: F32, basis: F32, regions: Regions, coefficients: F3
 
     template [D, 3] m, basis [K, D, 3], coefficients [..., K] m -> [...]. ModelError without those regions.
     """
-    upper, lower = _inner_lips_mm(template, basis, regions, coefficients)
+    upper, lower = _middles_mm(template, basis, regions, coefficients, INNER_LIPS)
     return upper[..., 1] - lower[..., 1]
+
+
+def eyelid_opening_mm(template: F32, basis: F32, regions: Regions, coefficients: F32) -> F32:
+    """Vertical gap of the middles of the lids, mm, mean of both eyes; as `lip_opening_mm`."""
+    gaps = []
+    for pair in EYELIDS:
+        upper, lower = _middles_mm(template, basis, regions, coefficients, pair)
+        gaps.append(upper[..., 1] - lower[..., 1])
+    opening: F32 = np.float32(0.5) * (gaps[0] + gaps[1])
+    return opening
 
 
 def vertex_distance(sample: F32, reference: F32) -> F32:
@@ -249,10 +262,12 @@ def _vertices(regions: Regions, name: str) -> NDArray[np.int32]:
     return regions[name]
 
 
-def _inner_lips_mm(template: F32, basis: F32, regions: Regions, coefficients: F32) -> tuple[F32, F32]:
-    """Middle of the upper and of the lower inner lip, [..., 3] mm each; loops run corner to corner."""
+def _middles_mm(
+    template: F32, basis: F32, regions: Regions, coefficients: F32, names: tuple[str, str]
+) -> tuple[F32, F32]:
+    """Middles of two loops that run from corner to corner, [..., 3] mm each."""
     ends = []
-    for name in ("inner_lip_upper", "inner_lip_lower"):
+    for name in names:
         loop = _vertices(regions, name)
         middle = loop[len(loop) // 2]
         ends.append(1000 * (template[middle] + np.tensordot(coefficients, basis[:, middle], axes=1)))
@@ -261,7 +276,7 @@ def _inner_lips_mm(template: F32, basis: F32, regions: Regions, coefficients: F3
 
 def _lip_distance_mm(template: F32, basis: F32, regions: Regions, coefficients: F32) -> F32:
     """Distance of the middles of the inner lips, mm: what the paper's Lip-Sync compares; [..., K] -> [...]."""
-    upper, lower = _inner_lips_mm(template, basis, regions, coefficients)
+    upper, lower = _middles_mm(template, basis, regions, coefficients, INNER_LIPS)
     distance: F32 = np.linalg.norm(upper - lower, axis=-1)
     return distance
 

@@ -17,6 +17,7 @@ from torch import Tensor, distributed
 from torch.nn.parallel import DistributedDataParallel
 
 from model.architectures import build_network
+from model.blinks import independent_blinks
 from model.checkpoint import Checkpoint, State, read_tensors, serialize, write_atomically
 from model.dataset import Batch, Crops, Sequence
 from model.diffusion import Diffusion, Progress
@@ -55,10 +56,10 @@ class Trainer:
         self._checkpoint = checkpoint
         self._tensorboard = tensorboard
         self._device = available_device(self.config.device)
-        self._crops = Crops(sequences, checkpoint.standardization, self.config.frames, self._device)
-        scale, spread = map(
-            torch.from_numpy, (checkpoint.standardization.scale, checkpoint.standardization.spread)
-        )
+        opened, blinks = independent_blinks(checkpoint, sequences, self.config.seed)
+        standardization = checkpoint.standardization
+        self._crops = Crops(opened, standardization, self.config.frames, self._device, blinks)
+        scale, spread = map(torch.from_numpy, (standardization.scale, standardization.spread))
         weights = coefficient_weights(scale, spread, self.config.metric_power)
         self._diffusion: Diffusion = checkpoint.diffusion().to(self._device)
         self._network = build_network(checkpoint.config)
@@ -72,13 +73,17 @@ class Trainer:
             self._gradient = _averaged(DistributedDataParallel(objective))
         # In the network's own order, which a loaded file does not keep: the average follows tensor by tensor.
         self._average = {name: value.clone() for name, value in self._network.state_dict().items()}
+        self._parameters = list(self._network.parameters())
         self._optimizer = torch.optim.AdamW(
-            self._network.parameters(),
+            self._parameters,
             lr=self.config.learning_rate,
             weight_decay=self.config.weight_decay,
             fused=True,
         )
-        self._parameters = [p for _, p in self._network.named_parameters()]
+        # What a subject's model forgets of the subject's motion, it falls back to the base model's for.
+        own = self._network.moving_parameters() if checkpoint.kind == "subject" else []
+        self._moving: list[Tensor] = list(own)
+        self._start = [parameter.detach().clone() for parameter in own]
         self.step = 0
         self._losses: list[Tensor] = []
         if (self.folder / STATE_FILE).exists():
@@ -131,8 +136,16 @@ class Trainer:
         mine = slice(self._rank, None, self._world)
         loss = self._gradient(batch.part(mine), draws.part(mine).to(self._device))
         self._optimizer.step()
+        self._return()
         self._follow()
         return loss
+
+    @torch.no_grad()
+    def _return(self) -> None:
+        """A subject's motion weights decay to those that they started from: what the optimizer led to zero too much."""
+        if self._moving:
+            share = self.config.weight_decay * self.config.learning_rate
+            torch._foreach_add_(self._moving, self._start, alpha=share)
 
     @torch.no_grad()
     def _follow(self) -> None:

@@ -137,12 +137,13 @@ def test_what_it_learns_beats_the_mean_on_unseen_motion(
     tmp_path: Path, parametrization: str, architecture: str
 ) -> None:
     train, unseen = talker.sequence(900, 0), talker.sequence(300, 1)
-    # Each of the talker's few features matters: none is dropped.
+    # Each of the talker's few features matters, and each iteration: none is dropped, few go without speech.
     config = TrainingConfig(
         iterations=300,
         batch=16,
         frames=16,
         learning_rate=3e-3,
+        unconditional=0.1,
         ema=0.98,
         feature_dropout=0.0,
         candidates=1,
@@ -291,3 +292,17 @@ def test_a_recorded_gradient_is_the_gradient(precision: str) -> None:
             objective.parameters(), torch.autograd.grad(whole, list(objective.parameters()))
         ):
             torch.testing.assert_close(parameter.grad, value)
+
+
+@pytest.mark.parametrize("kind", ["base", "subject"])
+def test_decay_leads_a_subject_back_to_where_its_motion_started(tmp_path: Path, kind: str) -> None:
+    """A decay of the whole distance in each step: what is left is where it leads to, and one step of Adam."""
+    checkpoint, sequences = start()
+    checkpoint = replace(talker.shaken(checkpoint), kind=kind)
+    step = 1e-3
+    config = replace(TINY, iterations=3, candidates=1, learning_rate=step, weight_decay=1 / step)
+    trainer = Trainer(checkpoint, sequences, tmp_path, config)
+    trainer.train()
+    for name, value in trainer.checkpoint().network.items():
+        back = checkpoint.network[name] if kind == "subject" and "audio" not in name else 0 * value
+        assert (value - back).abs().max() <= 1.1 * step
