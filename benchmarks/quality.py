@@ -138,6 +138,7 @@ def main() -> None:
     parser.add_argument("--learning-rate", type=float, default=defaults.learning_rate)
     parser.add_argument("--feature-dropout", type=float, default=defaults.feature_dropout)
     parser.add_argument("--weight-decay", type=float, default=defaults.weight_decay)
+    parser.add_argument("--anchor", type=float, default=defaults.anchor)
     parser.add_argument("--unconditional", type=float, default=defaults.unconditional)
     parser.add_argument("--ema", type=float, default=defaults.ema)
     parser.add_argument("--metric-power", type=float, default=defaults.metric_power)

@@ -2,7 +2,7 @@
 
 Some people blink four times in a clip. Shown beside the words that were being said, four are learned by heart: the
 network then blinks at these words, and never at others (docs/method.md). So training sees each moment with the eyes
-open, and with blinks of the same person that fall at random, as often as the person's do.
+open, and with blinks of the same person that fall at random, so often that samples have about as many as the person.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ SHUT, OPEN = 0.65, 0.75
 LEAST_CHANGE, LONGEST_FRAMES = 0.02, 20
 # What moves with the lids: all that is as near as the first, nothing beyond the second.
 NEAR_M, FAR_M = 0.015, 0.035
+# A network that learns by squared error draws what is rare about half as often as it was shown.
+SHOWN_TIMES = 2.0
 DRAWN_FRAMES = 20_000
 
 
@@ -48,7 +50,7 @@ def independent_blinks(
         blinks = [blink for _, some in own for blink in some]
         if blinks:
             every = sum(int(q.valid.sum()) for q, _ in own) / len(blinks)
-            drawn[style] = at_random(blinks, every, DRAWN_FRAMES, random)
+            drawn[style] = at_random(blinks, every / SHOWN_TIMES, DRAWN_FRAMES, random)
     return [q for q, _ in opened], drawn if drawn.any() else None
 
 

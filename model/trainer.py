@@ -142,10 +142,10 @@ class Trainer:
 
     @torch.no_grad()
     def _return(self) -> None:
-        """A subject's motion weights decay to those that they started from: what the optimizer led to zero too much."""
+        """What makes the optimizer's decay, which leads to zero, lead a subject's motion to the anchor."""
         if self._moving:
-            share = self.config.weight_decay * self.config.learning_rate
-            torch._foreach_add_(self._moving, self._start, alpha=share)
+            decay = self.config.weight_decay * self.config.learning_rate
+            torch._foreach_add_(self._moving, self._start, alpha=decay * self.config.anchor)
 
     @torch.no_grad()
     def _follow(self) -> None:

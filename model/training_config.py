@@ -20,8 +20,8 @@ class TrainingConfig:
     """Length of a crop."""
     learning_rate: float = 1e-3
     """The paper's is 1e-4, in vertex space; standardized coefficients bear more and need it (docs/method.md)."""
-    unconditional: float = 0.3
-    """Share of the batch whose audio condition is zeroed; the paper's is 0.1 (docs/method.md)."""
+    unconditional: float = 0.1
+    """Share of the batch whose audio condition is zeroed."""
     velocity: float = 10.0
     """Weight of the velocity term."""
     metric_power: float = 0.5
@@ -31,7 +31,9 @@ class TrainingConfig:
     feature_dropout: float = 0.3
     """Share of the speech channels zeroed in a crop: less is learned by heart (ours; docs/method.md)."""
     weight_decay: float = 0.3
-    """Decoupled from the gradient, to zero; a subject's motion weights to the base model's (ours; docs/method.md)."""
+    """AdamW's, decoupled from the gradient: keeps samples from agreeing too much (ours; docs/method.md)."""
+    anchor: float = 0.5
+    """A subject's motion weights decay to this share of those they start from: calmer samples (ours; docs/method.md)."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Of the matrix products; weights, loss and sums stay in float32. auto: bfloat16 where it is fast (ours)."""
     device: str = "cpu"

@@ -164,7 +164,7 @@ def read_faces(mesh: Path, vertex_count: int) -> NDArray[np.int32]:
 
 def _of_many(config: TrainingConfig) -> TrainingConfig:
     """Without what holds fine-tuning back from learning one minute by heart: measured for that, the paper's else."""
-    return replace(config, unconditional=0.1, feature_dropout=0.0, weight_decay=0.0)
+    return replace(config, feature_dropout=0.0, weight_decay=0.0)
 
 
 def _trained(

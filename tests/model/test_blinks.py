@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from model.blinks import at_random, blink_spans, independent_blinks
+from model.blinks import SHOWN_TIMES, at_random, blink_spans, independent_blinks
 from model.checkpoint import Checkpoint
 from model.dataset import Crops, Sequence
 from model.metrics import EYELIDS, eyelid_opening_mm
@@ -86,7 +86,7 @@ def test_as_often_and_at_other_moments() -> None:
         _, drawn = independent_blinks(checkpoint, [blinking()], seed)
         shut = drawn[0, :, 0] > 0.5 * drawn[0].max()
         counts.append(int((shut[1:] & ~shut[:-1]).sum()))
-    assert np.mean(counts) == pytest.approx(len(drawn[0]) * len(AT) / 300, rel=0.05)
+    assert np.mean(counts) == pytest.approx(SHOWN_TIMES * len(drawn[0]) * len(AT) / 300, rel=0.05)
     assert len(set(counts)) > 1
     often = at_random([np.ones((9, 1), np.float32)], 3.0, 1000, np.random.default_rng(0))
     assert 0.5 < often.mean() < 1  # more often than they fit: no endless loop
@@ -104,7 +104,7 @@ def test_each_style_has_its_own() -> None:
     assert torch.equal(ours.style, theirs.style) and torch.equal(ours.audio, theirs.audio)
     changed = (ours.motion != theirs.motion).any(0).any(-1)
     assert not changed[ours.style == 0].any()
-    assert 0.1 < changed[ours.style == 1].float().mean() < 0.6
+    assert 0.2 < changed[ours.style == 1].float().mean() < 0.8
 
 
 def test_nothing_to_be_found() -> None:
