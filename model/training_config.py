@@ -33,7 +33,7 @@ class TrainingConfig:
     weight_decay: float = 0.3
     """AdamW's, decoupled from the gradient: keeps samples from agreeing too much (ours; docs/method.md)."""
     anchor: float = 0.5
-    """A subject's motion weights decay to this share of those they start from: calmer samples (ours; docs/method.md)."""
+    """A subject's motion weights decay to this share of those they start from: calms samples (ours; docs/method.md)."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Of the matrix products; weights, loss and sums stay in float32. auto: bfloat16 where it is fast (ours)."""
     device: str = "cpu"
