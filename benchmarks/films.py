@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks import ground_truth, props, rendered_heads
+from benchmarks import ground_truth, mouths, props, rendered_heads
 from benchmarks.ground_truth import GroundTruth
 from benchmarks.rendered_heads import FPS, Scene, scene_motion, stranger
 from personalize import talkers, video_writer
 from personalize.feature_cache import cache_folder
 from personalize.files import sha256_json
 from personalize.talkers.motion import TalkerMotion
-from personalize.talkers.skin import backdrop, painted, seen_faces, skin_block, texture
+from personalize.talkers.skin import backdrop, painted, skin_block, texture
 from personalize.video_writer import VideoWriter
 from tracker import raster
 from tracker.head import HeadModel
-from tracker.raster import project, rasterize, shade, vertex_normals
+from tracker.raster import Raster, project, rasterize, shade, vertex_normals
 from tracker.track import F32, F64
 
 U8 = NDArray[np.uint8]
@@ -33,11 +33,12 @@ SUPERSAMPLING = 2
 LENS_BLUR_PX = 0.6
 SHININESS = 12.0
 SHORT_PX = 0.5  # a movement during the exposure that blurs nothing
-LOWER_TEETH = 0.35  # of their colour: the mesh's row is a plate that would pass for a lip
-IN_MOUTH = 0.25  # share of the key light
+IN_MOUTH = 0.5  # share of the key light
+LIP_GLOSS = 1.8  # of the skin's
+LIP_SOFTNESS = 0.4
 HAND_COLOUR = (205.0, 165.0, 148.0)
 MADE_BY = (
-    *(module.__file__ for module in (ground_truth, props, rendered_heads, raster, video_writer)),
+    *(module.__file__ for module in (ground_truth, mouths, props, rendered_heads, raster, video_writer)),
     *sorted(str(path) for path in Path(talkers.__path__[0]).glob("*.py")),
     __file__,
 )
@@ -61,7 +62,7 @@ def film(scene: Scene, head: HeadModel) -> tuple[Path, GroundTruth]:
 
 def shoot(scene: Scene, head: HeadModel, path: Path) -> GroundTruth:
     """Render a scene to the video `path`."""
-    person, moves = stranger(head, scene), scene_motion(scene)
+    person, moves = mouths.furnished(stranger(head, scene)), scene_motion(scene)
     weights = moves.expression_for(person.expression_names)
     studio = _Studio(scene, person, moves)
     covered, gaps = np.zeros(len(weights)), np.zeros(len(weights))
@@ -98,19 +99,24 @@ class _Studio:
         self._props = [props.glasses(person)] if scene.glasses else []
         if scene.hand:
             self._props.append(props.hand(person))
-        parts, first = [seen_faces(person)], len(person.template)
+        parts, first = [person.faces], len(person.template)
         for prop in self._props:
             parts.append(prop.faces + first)
             first += len(prop.vertices)
         self._faces = np.concatenate(parts).astype(np.int32)
         self._own = len(parts[0])
-        self._inside = _inside(person)
+        self._inside = mouths.within(person)
         self._albedo = np.concatenate(
             [_painted(person, scene), *(_prop_paint(prop, scene) for prop in self._props)]
         )
         self._places = np.concatenate([person.template, *(p.vertices for p in self._props)]).astype(
             np.float32
         )
+        self._gloss = np.ones((len(self._places), 1))
+        self._gloss[person.regions["lips"]] = LIP_GLOSS
+        self._soft = np.zeros((len(self._places), 1))
+        self._soft[person.regions["lips"]] = LIP_SOFTNESS
+        self._detail = mouths.MouthDetail.of(person, len(self._places), scene.seed)
         noses = self._turns.apply(person.template[person.regions["face"]].mean(0)) + moves.translation
         self._path = project(noses, scene.focal * max(scene.size), (0, 0))
 
@@ -130,7 +136,12 @@ class _Studio:
         colour = self._lit(posed, frame)
         around[:] = shade(seen, self._faces, posed, colour, around, ambient=1.0)
         texture(around, seen, self._faces, self._places, self._block)
-        lips = pixels[self._person.regions["lips"], :2].round().astype(int)
+        lips = pixels[self._person.regions["lips"], :2]
+        scale = self._focal / float(posed[self._person.regions["lips"], 2].mean())
+        part = mouths.window(lips, (right - left, bottom - top), scale)
+        part_seen = Raster(seen.triangle[part], seen.barycentric[part], seen.depth[part])
+        self._detail.lay(around[part], part_seen, self._faces, scale)
+        lips = lips.round().astype(int)
         inside = ((lips >= 0) & (lips < seen.triangle.shape[::-1])).all(1)
         covered = float((seen.triangle[lips[inside, 1], lips[inside, 0]] >= self._own).mean())
         return self._exposed(picture, frame), covered
@@ -147,9 +158,10 @@ class _Studio:
         view = -posed / np.linalg.norm(posed, axis=1, keepdims=True)
         between = view + light
         between /= np.linalg.norm(between, axis=1, keepdims=True)
-        facing = np.maximum(normals @ light, 0)[:, None]
+        # Light gets some way through lips.
+        facing = np.maximum((normals @ light)[:, None] + self._soft, 0) / (1 + self._soft)
         facing[self._inside] = IN_MOUTH  # no shadows are cast, but lips and cheeks would
-        shine = scene.gloss * np.maximum((normals * between).sum(1), 0)[:, None] ** SHININESS
+        shine = scene.gloss * self._gloss * np.maximum((normals * between).sum(1), 0)[:, None] ** SHININESS
         reflected = (self._albedo / 255) ** 2 * (scene.ambient + (1 - scene.ambient) * 1.3 * facing)
         return (255 * np.sqrt(np.clip(reflected + shine * facing, 0, 1))).astype(np.uint8)
 
@@ -179,11 +191,6 @@ def _streak(moved: F64) -> F32:
     return kernel / kernel.sum()
 
 
-def _inside(person: HeadModel) -> NDArray[np.int32]:
-    """Vertices within the mouth."""
-    return np.concatenate([person.regions["mouth"], person.regions["teeth"], person.behind_lips()])
-
-
 def _prop_paint(prop: props.Prop, scene: Scene) -> F64:
     """[V, 3] one colour; a hand has the person's skin."""
     colour = np.array(HAND_COLOUR) * scene.skin if prop.moves else props.FRAME_COLOUR
@@ -194,11 +201,9 @@ def _painted(person: HeadModel, scene: Scene) -> F64:
     """[D, 3] the person's albedo: skin, hair, stubble."""
     albedo = painted(person).astype(np.float64)
     skin_parts = np.ones(len(albedo), bool)
-    skin_parts[np.concatenate([person.regions["eyes"], _inside(person)])] = False
+    skin_parts[np.concatenate([person.regions["eyes"], mouths.within(person)])] = False
     albedo[skin_parts] *= scene.skin
-    teeth = person.regions["teeth"]
-    low = teeth[person.template[teeth, 1] < person.template[teeth, 1].mean()]
-    albedo[low] *= LOWER_TEETH
+    mouths.paint(albedo, person, scene.skin, scene.seed)
     albedo[person.regions["scalp"]] = 255 * np.array(scene.hair)
     beard = np.setdiff1d(person.regions["face"], person.regions["lips"])
     nose = person.template[person.regions["lips"], 1].max() + 0.006

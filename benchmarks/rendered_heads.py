@@ -27,6 +27,7 @@ TURN_S, TURN_BACK_S, TURN_RISE_S = (
     2.74,
     0.2,
 )  # of the fast head turn: when, when back, how long each takes
+LIP_ROLL = 0.4  # of the demo's: lower lips on real film hardly roll in, not at /f v/ either
 Colour = tuple[float, float, float]
 
 
@@ -169,6 +170,9 @@ def scene_motion(scene: Scene) -> TalkerMotion:
     motion = talker_motion(
         _phones(scene.speech_start_s), scene.seconds, FPS, scene.seed, style, None, distance
     )
+    rolled = motion.expression.copy()
+    rolled[:, motion.names.index("mouthRollLower")] *= LIP_ROLL
+    motion = replace(motion, expression=rolled)
     if not scene.speaks:
         motion = replace(
             motion,
