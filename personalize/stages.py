@@ -242,7 +242,7 @@ class Registration(Stage):
 class Finetune(Stage):
     """Motion + speech -> the subject's checkpoint."""
 
-    name, version, reads, resumes = "finetune", 7, ("iterations", "seed", "device"), True
+    name, version, reads, resumes = "finetune", 8, ("iterations", "seed", "device"), True
     needs = (
         "ingest/audio.wav",
         "ingest/split.json",
