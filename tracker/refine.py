@@ -1,17 +1,19 @@
-"""Refine a clip's landmark track by the grey levels of the skin, in bounded memory: one stretch at a time."""
+"""Refine a clip's landmark track by its pictures: openings by colours, then all by grey levels, stretch by stretch."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.fit import make_track, resume, runs, smoothness_between, trusted
+from tracker.fit import make_track, resume, runs, smoothness_between, trusted, with_lips_shut
+from tracker.key_frames import key_frames
+from tracker.lip_opening import LipLines, lip_widths
 from tracker.rigid_pose import hold_poses
-from tracker.skin_fit import Photometry, Subject, fit_stretch, learn_levels
+from tracker.skin_fit import Photometry, Subject, fit_openings, fit_stretch, learn_levels
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
 from tracker.view import U8, Index
 
@@ -54,8 +56,8 @@ def refine_track(
     each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
     look like keeps its landmark fit, and so does one whose picture is missing. bundle, evidence: see `fit_track`; the
     grey levels tell rotation less well than the bundle, so its poses are taken again.
-    What it gains is printed by `python -m benchmarks tracking`: pose and jitter mostly; the lips' openings are left
-    to the landmarks, see `Photometry.pair_noise_mm`.
+    What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips
+    (tracker/lip_opening.py), pose and jitter by the grey levels of the skin.
     """
     photometry = photometry or Photometry()
     energy, x, observed, good = resume(track, landmarks, camera, head, evidence)
@@ -63,16 +65,26 @@ def refine_track(
     if not len(good):
         return Refined(track, unknown)
     subject = Subject.of(head, track.identity, energy, photometry)
-    keys, cuts = _looked_at(subject, camera, frames, good)
+    lines = LipLines.across(observed, energy.px_per_m, x)
+    keys, cuts, colours = _looked_at(subject, lines, camera, frames, good)
     if not keys:
         return Refined(track, unknown)
+    rows = np.array(list(colours))
+    widths = lip_widths(np.stack(list(colours.values())), lines.marks[rows])
+    if widths is not None:
+        observed = lines.opened(observed, rows, widths)
+        subject = _with_landmarks(subject, observed, x)
+        smoothness = smoothness_between(subject.energy, landmarks.time, good[rows], segment)
+        x[rows] = fit_openings(subject, rows, x[rows], smoothness)
     rows = np.array(list(keys))
     levels = learn_levels(subject, list(keys.values()), rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
     refined = x.copy()
     for start, part in _stretches(cuts, len(good)):
         rows = np.array(list(part))
-        smoothness = smoothness_between(energy, landmarks.time, good[rows], segment, photometry.smoothness)
+        smoothness = smoothness_between(
+            subject.energy, landmarks.time, good[rows], segment, photometry.smoothness
+        )
         found, before, after = fit_stretch(subject, levels, list(part.values()), rows, x[rows], smoothness)
         better = np.isfinite(found).all(1) & (after[:, 0] < before[:, 0])
         own = (rows >= start) & (rows < start + STRETCH)
@@ -82,32 +94,46 @@ def refine_track(
             progress(min(start + STRETCH, len(good)), len(good))
     if camera.method != "prior":
         refined = hold_poses(refined, bundle, good, runs(good, segment), trusted(evidence, good))
-    out = make_track(
-        landmarks, camera, head, energy, observed, track.identity.astype(np.float64), refined, good
-    )
+    identity = track.identity.astype(np.float64)
+    out = make_track(landmarks, camera, head, subject.energy, observed, identity, refined, good)
     return Refined(out, _relative(deviation, good, len(track.time)))
 
 
+def _with_landmarks(subject: Subject, observed: F64, x: F64) -> Subject:
+    """The subject whose landmarks lie at observed [n, 478, 2] px; of x [n, U] the rotations are read."""
+    energy = replace(subject.energy, observed=observed[:, subject.energy.model.landmarks])
+    rest = key_frames(observed, energy.px_per_m)[0]
+    return replace(subject, energy=with_lips_shut(energy, x, rest))
+
+
 def _looked_at(
-    subject: Subject, camera: Camera, frames: Callable[[], Iterable[Frame]], good: Index
-) -> tuple[dict[int, U8], Iterable[tuple[int, U8]]]:
-    """Rows and cut-out faces of the key frames, and of all frames `good`; a short clip's pictures are read once."""
-    keys, rows = np.unique(np.linspace(0, len(good) - 1, KEYS).round().astype(int)), np.arange(len(good))
-    if len(good) * subject.window.size[0] * subject.window.size[1] > HELD_BYTES:
-        chosen = dict(_cuts(subject, camera, frames(), good[keys], keys))
-        return chosen, _cuts(subject, camera, frames(), good, rows)
-    held = dict(_cuts(subject, camera, frames(), good, rows))
-    return {row: held[row] for row in keys.tolist() if row in held}, held.items()
+    subject: Subject, lines: LipLines, camera: Camera, frames: Callable[[], Iterable[Frame]], good: Index
+) -> tuple[dict[int, U8], Iterable[tuple[int, U8]], dict[int, U8]]:
+    """By rows: cut-out faces of the key frames, and of all frames `good`, and these frames' colours along the lines.
+
+    A short clip's pictures are read once.
+    """
+    keys = set(np.linspace(0, len(good) - 1, KEYS).round().astype(int).tolist())
+    short = len(good) * subject.window.size[0] * subject.window.size[1] <= HELD_BYTES
+    held: dict[int, U8] = {}
+    colours: dict[int, U8] = {}
+    for row, rgb in _pictures(camera, frames(), good):
+        colours[row] = lines.read(rgb, row)
+        if short or row in keys:
+            held[row] = subject.window.cut(rgb, row)
+    chosen = {row: cut for row, cut in held.items() if row in keys}
+    if short:
+        return chosen, held.items(), colours
+    again = _pictures(camera, frames(), good)
+    return chosen, ((row, subject.window.cut(rgb, row)) for row, rgb in again), colours
 
 
-def _cuts(
-    subject: Subject, camera: Camera, frames: Iterable[Frame], wanted: Index, rows: Index
-) -> Iterator[tuple[int, U8]]:
-    """Row and cut-out face of each frame wanted [n], in order. rows: [n] of the subject's windows."""
-    row_of = dict(zip(wanted.tolist(), rows.tolist()))
+def _pictures(camera: Camera, frames: Iterable[Frame], good: Index) -> Iterator[tuple[int, U8]]:
+    """Row and picture of each of the frames `good` [n], in order, the lens's distortion taken out."""
+    row_of = {frame: row for row, frame in enumerate(good.tolist())}
     for frame, (_, rgb) in enumerate(frames):
         if frame in row_of:
-            yield row_of[frame], subject.window.cut(camera.lens.picture(rgb), row_of[frame])
+            yield row_of[frame], camera.lens.picture(rgb)
 
 
 def _stretches(cuts: Iterable[tuple[int, U8]], total: int) -> Iterator[tuple[int, dict[int, U8]]]:

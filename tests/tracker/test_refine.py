@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tracker import refine
 from tracker.confidence import judge
+from tracker.energy import LIP_PAIRS
 from tracker.fit import fit_track, make_track, resume
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
@@ -26,11 +27,16 @@ NO_BUNDLE = Bundle(
 )
 
 
-def freckled() -> np.ndarray:
-    """[D, 3] u8: something to hold on to, as skin has, and a mouth whose inside begins behind the lips."""
+def freckled(inside: float = 1.0) -> np.ndarray:
+    """[D, 3] u8: something to hold on to, as skin has, and a mouth whose inside begins behind the lips.
+
+    inside: share of the light that reaches the mouth's inside.
+    """
     mottle = np.random.default_rng(5).uniform(0.75, 1.0, (len(HEAD.template), 1))
-    albedo = HEAD.albedo.copy()
+    albedo = HEAD.albedo.astype(np.float64)
     albedo[HEAD.behind_lips()] = np.median(albedo[HEAD.regions["mouth"]], axis=0)
+    dim = [HEAD.regions[name] for name in ("mouth", "teeth", "tongue")]
+    albedo[np.union1d(np.concatenate(dim), HEAD.behind_lips())] *= inside
     return (albedo * mottle).astype(np.uint8)
 
 
@@ -56,6 +62,16 @@ class Film:
 
 @pytest.fixture(scope="module")
 def film() -> Film:
+    return filmed(freckled())
+
+
+@pytest.fixture(scope="module")
+def dark_mouth() -> Film:
+    """A mouth whose inside lies in shadow, read as the landmarker reads it: an error of the opening that lingers."""
+    return filmed(freckled(inside=0.4), opening_error_mm=0.8)
+
+
+def filmed(albedo: np.ndarray, opening_error_mm: float = 0.0) -> Film:
     rng = np.random.default_rng(0)
     t = np.arange(FRAMES) / 25
     expression = np.zeros((FRAMES, len(NAMES)), np.float32)
@@ -68,7 +84,6 @@ def film() -> Film:
     person = np.broadcast_to(identity, (FRAMES, len(identity)))
     vertices = HEAD.vertices(person, expression)
     posed = (vertices @ rotation.transpose(0, 2, 1) + translation[:, None]).astype(np.float32)
-    albedo = freckled()
     pictures = [render(one, HEAD.faces, albedo, FOCAL, (159.5, 159.5), SIZE) for one in posed]
     noisy = [np.clip(p + rng.normal(size=p.shape) * 2, 0, 255).astype(np.uint8) for p in pictures]
     seen = HEAD.landmark_positions(person, expression) @ rotation.transpose(0, 2, 1) + translation[:, None]
@@ -77,6 +92,12 @@ def film() -> Film:
     direction, phase = rng.normal(size=(FRAMES, 6, 2)), rng.uniform(0, 6, (FRAMES, 6))
     wave = np.sin(np.einsum("nlx,nkx->nlk", pixels / 40, direction) + phase[:, None])
     pixels = pixels + 0.5 * np.einsum("nlk,nkx->nlx", wave, rng.normal(size=(FRAMES, 6, 2)))
+    error_mm = np.convolve(rng.normal(size=FRAMES + 2), np.full(3, 3**-0.5), "valid") * opening_error_mm
+    half = 0.5e-3 * error_mm * (HEAD.lip_gap_mm(vertices) > 0.5) * FOCAL / DISTANCE
+    order = HEAD.landmark_embedding.landmarks.tolist()
+    upper, lower = np.array([[order.index(index) for index in pair] for pair in LIP_PAIRS]).T
+    pixels[:, upper, 1] -= half[:, None]
+    pixels[:, lower, 1] += half[:, None]
     points = np.zeros((FRAMES, POINTS, 3), np.float32)
     points[:, HEAD.landmark_embedding.landmarks] = np.dstack([pixels, seen[..., 2] * FOCAL / DISTANCE])
     scores = np.zeros((FRAMES, len(BLENDSHAPE_NAMES)), np.float32)
@@ -110,7 +131,14 @@ def test_pictures_lower_the_error(film: Film):
     assert np.nanmedian(refined.deviation[:, 0]) == pytest.approx(1, abs=1e-5)
 
 
-@pytest.mark.xfail(reason="openings are left to the landmarks (Photometry.pair_noise_mm)", strict=True)
+def test_a_dark_mouth_lowers_the_openings_error(dark_mouth: Film):
+    error = opening_error_mm(dark_mouth.refine().track, dark_mouth.gap)
+    assert error < 0.7 * opening_error_mm(dark_mouth.track, dark_mouth.gap)
+
+
+@pytest.mark.xfail(
+    reason="a lit tongue of the lips' colour tells nothing, and landmarks err by a quarter pixel", strict=True
+)
 def test_pictures_lower_the_openings_error(film: Film):
     error = opening_error_mm(film.refine().track, film.gap)
     assert error < 0.95 * opening_error_mm(film.track, film.gap)

@@ -1,0 +1,107 @@
+"""Openings read from painted mouths whose landmarks err as the landmarker does."""
+
+import numpy as np
+import pytest
+
+from tracker.energy import LIP_PAIRS, POSE
+from tracker.landmark_indices import POINTS
+from tracker.lip_opening import OUTER_PAIRS, SAMPLES, LipLines, lip_widths
+
+FRAMES, LIP_MM = 80, 7.0
+UPPER, LOWER, TOOTH, DARK, SKIN = (
+    (150, 80, 80),
+    (180, 100, 95),
+    (215, 210, 195),
+    (45, 20, 20),
+    (205, 165, 145),
+)
+
+
+def painted(
+    width: np.ndarray, inside: tuple[tuple[int, int, int], ...] = (TOOTH, DARK), gain: float = 1.0
+) -> np.ndarray:
+    """[n, 9, S, 3] u8: upper lip, teeth above darkness, lower lip along lines whose openings are width [n, 9] mm."""
+    rng = np.random.default_rng(1)
+    edge = np.stack([-width / 2 - LIP_MM, -width / 2, 0 * width, width / 2, width / 2 + LIP_MM], axis=-1)
+    colours = np.array([SKIN, UPPER, inside[0], inside[-1], LOWER, SKIN], np.float64)
+    # Each sample sees a little of its neighbours: edges are soft.
+    share = np.clip((SAMPLES - edge[..., None]) / 0.8 + 0.5, 0, 1)
+    steps = np.diff(colours, axis=0)
+    picture = colours[0] + np.einsum("nqes,ec->nqsc", share, steps)
+    return np.clip(gain * picture + rng.normal(size=picture.shape) * 4, 0, 255).astype(np.uint8)
+
+
+def marked(width: np.ndarray) -> np.ndarray:
+    """[n, 9, 4] mm: where landmarks would see the edges of lips that are width [n, 9] apart."""
+    return np.stack([-width / 2 - LIP_MM, -width / 2, width / 2, width / 2 + LIP_MM], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def openings() -> tuple[np.ndarray, np.ndarray]:
+    """True and landmarks' openings [n, 9] mm; half of the frames are shut."""
+    rng = np.random.default_rng(0)
+    true = np.repeat(np.maximum(8 * np.sin(np.arange(FRAMES) / 4), 0)[:, None], 9, axis=1)
+    error = np.convolve(rng.normal(size=FRAMES + 4), np.full(5, 0.45), "valid")
+    return true, np.maximum(1.1 * true + 0.4 + error[:, None] * (true > 0), 0.3)
+
+
+def test_colours_halve_the_landmarks_error(openings: tuple[np.ndarray, np.ndarray]):
+    true, seen = openings
+    widths = lip_widths(painted(true), marked(seen))
+    assert (widths - true).std() < 0.5 * (seen - true).std()
+    assert np.corrcoef(widths.ravel(), true.ravel())[0, 1] > 0.99
+
+
+def test_shut_lips_stay_shut(openings: tuple[np.ndarray, np.ndarray]):
+    true, seen = openings
+    widths = lip_widths(painted(true), marked(seen))
+    assert widths[true == 0].max() < seen[true == 0].min() + 0.2
+
+
+def test_light_changes_nothing(openings: tuple[np.ndarray, np.ndarray]):
+    true, seen = openings
+    dim = np.where(np.arange(FRAMES)[:, None, None, None] % 20 < 10, painted(true), painted(true, gain=0.6))
+    np.testing.assert_allclose(
+        lip_widths(dim, marked(seen)), lip_widths(painted(true), marked(seen)), atol=0.5
+    )
+
+
+def test_nothing_is_told_without_a_difference(openings: tuple[np.ndarray, np.ndarray]):
+    true, seen = openings
+    assert lip_widths(np.zeros_like(painted(true)), marked(seen)) is None
+    assert lip_widths(painted(true, inside=(UPPER, LOWER)), marked(seen)) is None
+
+
+def test_a_mouth_that_never_opens_tells_nothing():
+    shut = np.full((FRAMES, 9), 0.4)
+    assert lip_widths(painted(0 * shut), marked(shut)) is None
+    assert lip_widths(painted(0 * shut)[:1], marked(shut)[:1]) is None
+
+
+def face() -> np.ndarray:
+    """[1, 478, 2] px of an upright face at 2 px per mm, its lips 6 mm apart and 7 mm thick."""
+    points = np.zeros((1, POINTS, 2))
+    for column, (inner, outer) in enumerate(zip(LIP_PAIRS, OUTER_PAIRS)):
+        for index, y in zip((outer[0], *inner, outer[1]), (-10.0, -3.0, 3.0, 10.0)):
+            points[0, index] = 60 + 5 * column, 80 + 2 * y
+    return points
+
+
+def test_lines_run_down_the_face_in_millimetres():
+    lines = LipLines.across(face(), np.array([2000.0]), np.zeros((1, 3 + POSE)))
+    np.testing.assert_allclose(lines.marks[0], np.tile([-10.0, -3.0, 3.0, 10.0], (9, 1)), atol=1e-9)
+    rows = np.tile(np.arange(160, dtype=np.uint8)[:, None, None], (1, 160, 3))
+    np.testing.assert_allclose(lines.read(rows, 0)[4, :, 0], 80 + 2 * SAMPLES, atol=1)
+
+
+def test_lines_beyond_the_picture_read_its_border():
+    lines = LipLines.across(face() + 500, np.array([2000.0]), np.zeros((1, 3 + POSE)))
+    assert (lines.read(np.full((160, 160, 3), 7, np.uint8), 0) == 7).all()
+
+
+def test_opened_moves_both_lips_alike():
+    lines = LipLines.across(face(), np.array([2000.0]), np.zeros((1, 3 + POSE)))
+    opened = lines.opened(face(), np.array([0]), np.full((1, 9), 8.0))
+    (upper, lower) = np.transpose(LIP_PAIRS)
+    np.testing.assert_allclose(opened[0, lower] - opened[0, upper], np.tile([0.0, 16.0], (9, 1)))
+    np.testing.assert_allclose(opened[0, lower] + opened[0, upper], face()[0, lower] + face()[0, upper])

@@ -1,0 +1,195 @@
+"""How far the lips are apart in the pictures: the colours along lines across the mouth, told apart by the clip's own.
+
+The landmarker reads an opening wider or narrower as the head turns and follows quick closures too slowly. But it tells
+well enough which colours are lips and which are teeth, tongue or darkness: once these are learned, each line says
+itself where the one ends and the other begins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from tracker.energy import LIP_PAIRS, rotation_matrix
+from tracker.track import F32, F64
+from tracker.view import U8, Index
+
+# Outer edges of the upper and the lower lip above and below each pair of the inner ones.
+OUTER_PAIRS = (
+    *((185, 146), (40, 91), (39, 181), (37, 84), (0, 17)),
+    *((267, 314), (269, 405), (270, 321), (409, 375)),
+)
+STEP_MM, REACH_MM = 0.4, 13.0  # of the samples along a line, to both sides of the inner lips' middle
+SAMPLES = np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM)
+BLUR = 0.6  # standard deviation in steps, and no less than LEAST_BLUR_PX
+LEAST_BLUR_PX = 0.5
+DARK = 8.0  # grey levels added before the logarithm: below, colours are noise
+BINS = 20  # of each of three axes of colour
+LEAST_RANGE = 0.1  # of log colour along an axis: below, it is noise
+RARE = 0.01  # share of colours that have never been seen in a class
+UPPER, INSIDE, LOWER = range(3)
+LEARNED = 400  # frames, spread over the clip, that tell the colours
+OPEN_MM = 2.5  # lips farther apart than this show what is inside
+# From the landmarks' edges, where either may be seen. They lie outside more often than inside: wide openings are read
+# wider still, by about a tenth.
+LIP_MARGIN_MM, INSIDE_MARGIN_MM, INSIDE_SHARE = 0.5, 0.8, 0.15
+LEAST_INSIDE = 100  # samples; with fewer the clip hardly shows an open mouth
+MISTAKEN = 0.12  # share of what is inside that looks more like lips: above, the clip's colours tell nothing
+DOUBT = 1.0  # log likelihood ratio up to which a colour tells nothing: a tongue is nearly that of lips
+TRUSTED = 3.0  # the most that one sample counts, as log likelihood ratio
+PRIOR_MM = 1.0  # standard deviation of width and middle about the landmarks'
+
+
+@dataclass(frozen=True)
+class LipLines:
+    """Lines across the mouth of n frames, one through each of the Q pairs of inner-lip landmarks, down the face.
+
+    middle: [n, Q, 2] px, between the pair. step: [n, 2] px per mm on the face. marks: [n, Q, 4] mm along the line:
+    outer upper, inner upper, inner lower and outer lower edge by the landmarks.
+    """
+
+    middle: F64
+    step: F64
+    marks: F64
+
+    @classmethod
+    def across(cls, observed: F64, px_per_m: F64, x: F64) -> LipLines:
+        """Through landmarks [n, 478, 2] px of faces of the scale px_per_m [n], in the poses of x [n, U]."""
+        up = rotation_matrix(x[:, -6:-3])[:, :2, 1]
+        step = -1e-3 * px_per_m[:, None] * up / np.linalg.norm(up, axis=1, keepdims=True)
+        (upper, lower), (above, below) = np.transpose(LIP_PAIRS), np.transpose(OUTER_PAIRS)
+        middle = (observed[:, upper] + observed[:, lower]) / 2
+        edges = (
+            np.stack([observed[:, row] for row in (above, upper, lower, below)], axis=2) - middle[:, :, None]
+        )
+        marks = np.einsum("nqex,nx->nqe", edges, step) / (step**2).sum(1)[:, None, None]
+        return cls(middle, step, marks)
+
+    def read(self, rgb: U8, row: int) -> U8:
+        """[Q, S, 3] u8: the colours of a picture [H, W, 3] along the lines of frame `row`."""
+        places = self.middle[row][:, None] + SAMPLES[:, None] * self.step[row]
+        size = np.array(rgb.shape[1::-1])
+        low = np.clip(np.floor(places.min((0, 1))).astype(int) - 4, 0, size - 1)
+        high = np.clip(np.ceil(places.max((0, 1))).astype(int) + 5, low + 1, size)
+        blur = max(BLUR * STEP_MM * float(np.linalg.norm(self.step[row])), LEAST_BLUR_PX)
+        mouth = cv2.GaussianBlur(rgb[low[1] : high[1], low[0] : high[0]], (0, 0), blur)
+        x, y = np.moveaxis((places - low).astype(np.float32), 2, 0)
+        return cv2.remap(mouth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def opened(self, observed: F64, rows: Index, widths: F64) -> F64:
+        """The landmarks [n, 478, 2] px with the inner lips of frames `rows` [m] moved `widths` [m, Q] mm apart."""
+        out = observed.copy()
+        more = (widths - (self.marks[rows, :, 2] - self.marks[rows, :, 1])) / 2
+        move = more[..., None] * self.step[rows, None]
+        upper, lower = np.transpose(LIP_PAIRS)
+        out[rows[:, None], upper] -= move
+        out[rows[:, None], lower] += move
+        return out
+
+
+def lip_widths(colours: U8, marks: F64) -> F64 | None:
+    """[n, Q] mm between the lips, of colours [n, Q, S, 3] u8 along lines with the landmarks' marks [n, Q, 4].
+
+    The expectation over all places of both edges, under the colours' classes and a weak prior about the landmarks. None
+    where the clip's colours do not tell lips from what is between them.
+    """
+    learned = np.unique(np.linspace(0, len(colours) - 1, LEARNED).round().astype(int))
+    axes = _colour_axes(colours[learned], marks[learned])
+    low, high = np.quantile(axes.reshape(-1, 3), (0.005, 0.995), axis=0)
+    scale = BINS / np.maximum(high - low, LEAST_RANGE)
+    classes = _classes(marks[learned])
+    table = _likelihoods(_bins(axes, low, scale), classes)
+    if table is None:
+        return None
+    widths = np.empty(marks.shape[:2])
+    for rows in np.array_split(np.arange(len(colours)), max(1, len(colours) // LEARNED)):
+        seen = _bins(_colour_axes(colours[rows], marks[rows]), low, scale)
+        _expected_widths(table[:, seen], SAMPLES, marks[rows], widths[rows[0] : rows[-1] + 1])
+    return widths
+
+
+def _colour_axes(colours: U8, marks: F64) -> F32:
+    """[n, Q, S, 3] brightness, red and blue against green, as logarithms relative to the frame's lips."""
+    log = np.log(np.arange(256, dtype=np.float32) + np.float32(DARK))[colours]
+    lips = np.isin(_classes(marks), (UPPER, LOWER))
+    count = np.maximum(lips.sum((1, 2)), 1)[:, None]
+    log -= (np.einsum("nqsc,nqs->nc", log, lips.astype(np.float32)) / count)[:, None, None]
+    red, green, blue = np.moveaxis(log, -1, 0)
+    return np.stack([log.mean(-1), red - green, blue - green], axis=-1)
+
+
+def _classes(marks: F64) -> NDArray[np.int8]:
+    """[n, Q, S] what each sample shows if the landmarks are about right, -1 where they leave that open."""
+    above, upper, lower, below = np.moveaxis(marks[..., None], 2, 0)
+    at = SAMPLES
+    margin = np.maximum(INSIDE_MARGIN_MM, INSIDE_SHARE * (lower - upper))
+    out = np.full((*marks.shape[:2], len(at)), -1, np.int8)
+    out[(at > above) & (at < upper - LIP_MARGIN_MM)] = UPPER
+    out[(at > lower + LIP_MARGIN_MM) & (at < below)] = LOWER
+    out[(at > upper + margin) & (at < lower - margin) & (lower - upper > OPEN_MM)] = INSIDE
+    return out
+
+
+def _bins(axes: F32, low: F64, scale: F64) -> NDArray[np.int32]:
+    """Number of the bin of each colour [.., 3]."""
+    bins = np.clip((axes - low) * scale, 0, BINS - 1).astype(np.int32)
+    return (bins[..., 0] * BINS + bins[..., 1]) * BINS + bins[..., 2]
+
+
+def _likelihoods(bins: NDArray[np.int32], classes: NDArray[np.int8]) -> F32 | None:
+    """[3, BINS^3] log likelihood of a colour in each class, against the likeliest; None if they are not distinct."""
+    inside = bins[classes == INSIDE]
+    if len(inside) < LEAST_INSIDE:
+        return None
+    table = np.empty((3, BINS**3), np.float32)
+    for name in (UPPER, INSIDE, LOWER):
+        count = np.bincount(bins[classes == name], minlength=BINS**3).reshape(BINS, BINS, BINS)
+        smooth = gaussian_filter(count.astype(np.float64), 1.0, mode="nearest").ravel()
+        table[name] = np.log(smooth / max(smooth.sum(), 1e-9) + RARE / BINS**3)
+    mistaken = (table[INSIDE] <= np.maximum(table[UPPER], table[LOWER]))[inside].mean()
+    if mistaken > MISTAKEN:
+        return None
+    return np.clip(table - table.max(0) + DOUBT, -TRUSTED, 0)
+
+
+@njit(cache=True)
+def _expected_widths(likelihood, samples, marks, widths):  # type: ignore[no-untyped-def]
+    """Fills widths [n, Q] mm from log likelihoods [3, n, Q, S] at samples [S] mm; marks: [n, Q, 4] mm."""
+    before = np.zeros((3, len(samples) + 1))  # of all samples before an edge, class by class
+    for n in range(marks.shape[0]):
+        for q in range(marks.shape[1]):
+            above, upper, lower, below = marks[n, q]
+            for s in range(len(samples)):
+                known = above <= samples[s] <= below
+                for c in range(3):
+                    before[c, s + 1] = before[c, s] + (likelihood[c, n, q, s] if known else 0.0)
+            widths[n, q] = _expected_width(before, samples[0] - STEP_MM / 2, upper, lower)
+
+
+@njit(cache=True)
+def _expected_width(before, start, upper, lower):  # type: ignore[no-untyped-def]
+    """Mean width over all pairs of edges, upper first; edge k lies at start + k steps."""
+    edges = before.shape[1]
+    best, total, mean = -np.inf, 0.0, 0.0
+    for first in range(edges):
+        for last in range(first, edges):
+            width = (last - first) * STEP_MM
+            middle = start + (first + last) / 2 * STEP_MM
+            away = (width - lower + upper) ** 2 + (middle - (upper + lower) / 2) ** 2
+            value = (
+                before[0, first]
+                - before[1, first]
+                + before[1, last]
+                - before[2, last]
+                - away / (2 * PRIOR_MM**2)
+            )
+            if value > best:
+                total, mean, best = total * np.exp(best - value), mean * np.exp(best - value), value
+            share = np.exp(value - best)
+            total, mean = total + share, mean + share * width
+    return mean / total
