@@ -72,6 +72,8 @@ class Weights:
     """Factor on the expression prior in frames at rest: identity, not expression, explains them."""
     acceleration: tuple[float, float, float] = (0.2, 0.005, 0.001)
     """Standard deviation of the second difference at 25 fps: weights, rotation (rad), translation (m)."""
+    jerk: float = 3.0
+    """Cauchy scale, in standard deviations, of a pose's second difference: a head can be turned at once."""
 
 
 @dataclass(frozen=True)

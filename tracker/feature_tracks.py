@@ -21,7 +21,7 @@ MIN_PRESENCE = 0.5
 CORNERS = 250
 REPLENISH = 5  # followed frames between searches for new corners
 EYE_DISTANCE = (
-    120.0  # px between the outer eye corners, at most: a larger face is followed in a smaller picture
+    160.0  # px between the outer eye corners, at most: a larger face is followed in a smaller picture
 )
 REACH = 0.35  # eye distances, of the landmarks that carry a patch along
 MIN_SHRINK = 0.3  # of its area: a patch seen more aslant is not looked for

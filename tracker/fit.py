@@ -73,7 +73,7 @@ def fit_track(
     smoothness = smoothness_between(energy, landmarks.time, good, segment)
     x, _ = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
     if camera.method != "prior":
-        x = hold_poses(x, bundle, good, runs(good, segment), sound)
+        x = hold_poses(x, bundle, good, runs(good, segment), sound, 1.0)
     return make_track(landmarks, camera, head, energy, observed, identity, x, good)
 
 
@@ -181,7 +181,8 @@ def smoothness_between(
     sd = np.repeat(energy.weights.acceleration, (energy.model.expressions, 3, 3))
     # The integral of white noise bends by the power 1.5 of the interval.
     precision = factor / (sd * (interval / 0.04) ** 1.5) ** 2
-    return Smoothness.between(runs(good, segment), precision)
+    tolerated = factor * energy.weights.jerk**2
+    return Smoothness.between(runs(good, segment), precision, tolerated)
 
 
 def resume(

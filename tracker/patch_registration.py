@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from tracker.track import F32, F64
@@ -25,7 +26,7 @@ EDGE = 0.2  # ratio of the gradients' eigenvalues: below it a patch slides along
 MIN_CORRELATION = 0.7
 MAX_SHIFT = 3.0  # px, from where a patch is expected
 
-_GRID = np.stack(np.meshgrid(*2 * [np.arange(-HALF, HALF + 1.0)]), axis=-1).reshape(-1, 2)
+_GRID = np.stack(np.meshgrid(*2 * [np.arange(-HALF, HALF + 1.0)]), axis=-1).reshape(-1, 2).astype(np.float32)
 _WEIGHT = np.exp(-(_GRID**2).sum(1) / (2 * (0.6 * HALF) ** 2))
 _WEIGHT /= _WEIGHT.sum()
 
@@ -34,8 +35,8 @@ _WEIGHT /= _WEIGHT.sum()
 class Templates:
     """n patches of K pixels as they were first seen: values [n, K], mean 0, variance 1, and gradients [n, K, 2]."""
 
-    values: F64
-    gradients: F64
+    values: F32
+    gradients: F32
 
     def select(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> Templates:
         """Some of them."""
@@ -47,7 +48,7 @@ class Templates:
             np.concatenate([self.values, more.values]), np.concatenate([self.gradients, more.gradients])
         )
 
-    def information(self) -> F64:
+    def information(self) -> F32:
         """[n, 2, 2] of the shift."""
         return (self.gradients * _WEIGHT[:, None]).transpose(0, 2, 1) @ self.gradients
 
@@ -57,7 +58,7 @@ class Templates:
         return low > EDGE * high
 
 
-NO_TEMPLATES = Templates(np.zeros((0, len(_GRID))), np.zeros((0, len(_GRID), 2)))
+NO_TEMPLATES = Templates(np.zeros((0, len(_GRID)), np.float32), np.zeros((0, len(_GRID), 2), np.float32))
 
 
 def fine_texture(gray: NDArray[np.uint8]) -> F32:
@@ -70,12 +71,10 @@ def fine_texture(gray: NDArray[np.uint8]) -> F32:
 
 def cut_templates(texture: F32, xy: F64) -> Templates:
     """The patches about xy [n, 2] px."""
-    values, strength = _levelled(_sampled(texture, xy[:, None] + _GRID))
-    steps = [
-        _sampled(texture, xy[:, None] + _GRID + half) - _sampled(texture, xy[:, None] + _GRID - half)
-        for half in 0.5 * np.eye(2)
-    ]
-    return Templates(values, np.stack(steps, axis=-1) / strength[..., None])
+    count = len(xy), len(_GRID)
+    templates = Templates(np.empty(count, np.float32), np.empty((*count, 2), np.float32))
+    _cut(texture, xy.astype(np.float32), templates.values, templates.gradients)
+    return templates
 
 
 def register(texture: F32, guess: F64, bend: F64, templates: Templates) -> tuple[F64, NDArray[np.bool_]]:
@@ -83,35 +82,66 @@ def register(texture: F32, guess: F64, bend: F64, templates: Templates) -> tuple
 
     guess: [n, 2] px. bend: [n, 2, 2], how each patch is turned and stretched since it was cut.
     """
-    places = guess.copy()
-    around = _GRID @ bend.transpose(0, 2, 1)
-    slopes = templates.gradients * _WEIGHT[:, None]
-    inverse = np.linalg.inv(templates.information() + 1e-6 * np.eye(2))
-    length = np.full(len(guess), np.inf)
-    for _ in range(ITERATIONS):
-        error = _levelled(_sampled(texture, places[:, None] + around))[0] - templates.values
-        step = -np.einsum("nij,nj->ni", inverse, (error[:, None] @ slopes)[:, 0])
-        length = np.linalg.norm(step, axis=1)
-        step *= np.minimum(1, LONGEST_STEP / np.maximum(length, 1e-9))[:, None]
-        places += np.einsum("nij,nj->ni", bend, step)
-        if (length < SETTLED).all():
-            break
-    seen = _levelled(_sampled(texture, places[:, None] + around))[0]
-    correlation = (seen * templates.values) @ _WEIGHT
-    near = np.linalg.norm(places - guess, axis=1) < MAX_SHIFT
-    return places, (correlation > MIN_CORRELATION) & near & (length < 5 * SETTLED)
+    slopes = (templates.gradients * _WEIGHT[:, None]).transpose(0, 2, 1)
+    gain = np.linalg.inv(templates.information() + 1e-6 * np.eye(2)) @ slopes
+    places, correlation = guess.astype(np.float32), np.zeros(len(guess), np.float32)
+    _search(
+        *(texture, templates.values, gain.astype(np.float32), bend.astype(np.float32), places, correlation)
+    )
+    return places.astype(np.float64), correlation > MIN_CORRELATION
 
 
-def _levelled(patches: F64) -> tuple[F64, F64]:
-    """Patches [n, K] at mean 0 and variance 1, and their standard deviations [n, 1]."""
-    centred = patches - (patches @ _WEIGHT)[:, None]
-    strength = np.sqrt((centred**2) @ _WEIGHT)[:, None] + 1e-4
+@njit(cache=True)
+def _cut(texture, xy, values, gradients):  # type: ignore[no-untyped-def]
+    """Fills values and gradients of `Templates`."""
+    half = np.float32(0.5)
+    for n in range(len(xy)):
+        places = _GRID + xy[n]
+        values[n], strength = _levelled(_sampled(texture, places))
+        for axis in range(2):
+            step = half * np.eye(2, dtype=np.float32)[axis]
+            change = _sampled(texture, places + step) - _sampled(texture, places - step)
+            gradients[n, :, axis] = change / strength
+
+
+@njit(cache=True)
+def _search(texture, values, gain, bend, places, correlation):  # type: ignore[no-untyped-def]
+    """Moves places [n, 2] to where the patches look like their templates; those that do not settle keep correlation 0.
+
+    gain: [n, 2, K], the shift by the difference of a template from its patch.
+    """
+    for n in range(len(places)):
+        around, start = _GRID @ bend[n].T, places[n].copy()
+        for _ in range(ITERATIONS):
+            step = gain[n] @ (values[n] - _levelled(_sampled(texture, around + places[n]))[0])
+            length = np.hypot(step[0], step[1])
+            places[n] += bend[n] @ (step * np.float32(min(1.0, LONGEST_STEP / max(length, 1e-9))))
+            near = np.hypot(places[n, 0] - start[0], places[n, 1] - start[1]) < MAX_SHIFT
+            if length < SETTLED or not near:
+                break
+        if near and length < 5 * SETTLED:
+            seen = _levelled(_sampled(texture, around + places[n]))[0]
+            correlation[n] = (seen * values[n] * _WEIGHT).sum()
+
+
+@njit(cache=True)
+def _sampled(texture, xy):  # type: ignore[no-untyped-def]
+    """[K] bilinear at xy [K, 2] px, the border repeated."""
+    height, width = texture.shape
+    out = np.empty(len(xy), np.float32)
+    for k in range(len(xy)):
+        x, y = min(max(xy[k, 0], 0), width - 1), min(max(xy[k, 1], 0), height - 1)
+        i, j = min(int(x), width - 2), min(int(y), height - 2)
+        u, v = np.float32(x - i), np.float32(y - j)
+        top = texture[j, i] + (texture[j, i + 1] - texture[j, i]) * u
+        bottom = texture[j + 1, i] + (texture[j + 1, i + 1] - texture[j + 1, i]) * u
+        out[k] = top + (bottom - top) * v
+    return out
+
+
+@njit(cache=True)
+def _levelled(patch):  # type: ignore[no-untyped-def]
+    """A patch [K] at mean 0 and variance 1, and its standard deviation."""
+    centred = patch - (patch * _WEIGHT).sum()
+    strength = np.sqrt((centred * centred * _WEIGHT).sum()) + np.float32(1e-4)
     return centred / strength, strength
-
-
-def _sampled(texture: F32, xy: F64) -> F64:
-    """Bilinear, the border repeated."""
-    at = xy.astype(np.float32)
-    return cv2.remap(
-        texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    ).astype(np.float64)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 KEYS = 48  # frames, spread over the clip, that tell the albedo
 STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
+HALFWAY = 0.5  # to the bundle's poses: grey levels err as much, but slowly, and the tracks at random
 HELD_BYTES = 256 << 20  # of cut-out faces, about 100 s of them; a longer clip is read twice instead
 Frame = tuple[float, U8]
 
@@ -54,8 +55,8 @@ def refine_track(
 
     segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
     each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
-    look like keeps its landmark fit, and so does one whose picture is missing. bundle, evidence: see `fit_track`; the
-    grey levels tell rotation less well than the bundle, so its poses are taken again.
+    look like keeps its landmark fit, and so does one whose picture is missing. bundle, evidence: see `fit_track`; poses
+    end halfway between what the grey levels and the bundle tell.
     What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips
     (tracker/lip_opening.py), pose and jitter by the grey levels of the skin.
     """
@@ -93,7 +94,7 @@ def refine_track(
         if progress:
             progress(min(start + STRETCH, len(good)), len(good))
     if camera.method != "prior":
-        refined = hold_poses(refined, bundle, good, runs(good, segment), trusted(evidence, good))
+        refined = hold_poses(refined, bundle, good, runs(good, segment), trusted(evidence, good), HALFWAY)
     identity = track.identity.astype(np.float64)
     out = make_track(landmarks, camera, head, subject.energy, observed, identity, refined, good)
     return Refined(out, _relative(deviation, good, len(track.time)))

@@ -23,17 +23,18 @@ MIN_FRAMES = 8  # of a window: fewer do not tell how the two head frames lie to 
 # the landmarks' error; beyond it brows move, and what the tracks follow is not one rigid body.
 PLAUSIBLE, PLAUSIBLE_QUANTILE = np.radians(2.5), 0.95
 CERTAIN = np.array([[1.0], [1.0], [0.1]])  # of a landmark pose's place: depth is seen ten times less well
+LEAST_SEEN = 0.3  # of the points that a frame of the bundle usually sees: with fewer its pose may be anything
 FADE = 12  # frames beyond the end of a window over which its correction fades
 
 
-def hold_poses(x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], sound: Rows) -> F64:
-    """The unknowns x [n, P] of the frames good [n] with their poses moved onto the bundle's.
+def hold_poses(x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], sound: Rows, share: float) -> F64:
+    """The unknowns x [n, P] of the frames good [n] with their poses moved by a share of the way to the bundle's.
 
     run: [n], frames of one number follow each other without a break; nothing is carried from one to another.
     sound: rows of x whose poses tell how the two head frames lie to each other, and where the difference is known.
     """
     known = np.isin(bundle.frame, good[sound])
-    row = np.searchsorted(good, bundle.frame[known])
+    row, well_seen = np.searchsorted(good, bundle.frame[known]), _well_seen(bundle)[known]
     rotation = Rotation.from_rotvec(bundle.rotation[known]).as_matrix()
     translation = bundle.translation[known].astype(np.float64)
     step = np.median(np.diff(bundle.frame)) if len(bundle.frame) > 1 else 1
@@ -41,6 +42,7 @@ def hold_poses(x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], sound
     out = x.copy()
     found: dict[int, Corrections] = {}
     for part in np.split(np.arange(len(row)), ends):
+        part = part[well_seen[part]]
         if len(part) < MIN_FRAMES:
             continue
         change = _corrections(x[row[part]], rotation[part], translation[part])
@@ -48,11 +50,17 @@ def hold_poses(x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], sound
             found.setdefault(int(run[row[part[0]]]), []).append((row[part], change))
     for number, windows in found.items():
         mine = np.flatnonzero(run == number)
-        change = _between(windows, mine)
+        change = share * _between(windows, mine)
         turned = Rotation.from_rotvec(change[:, :3]).as_matrix() @ rotation_matrix(x[mine, -6:-3])
         out[mine, -6:-3] = rotation_vector(turned)
         out[mine, -3:] += change[:, 3:]
     return out
+
+
+def _well_seen(bundle: Bundle) -> NDArray[np.bool_]:
+    """[M] frames of the bundle that see as many of its points as it is usual: a blurred one loses most."""
+    seen = np.bincount(np.searchsorted(bundle.frame, bundle.observations[:, 0]), minlength=len(bundle.frame))
+    return seen >= LEAST_SEEN * (np.median(seen) if len(seen) else 0.0)
 
 
 def _corrections(x: F64, rotation: F64, translation: F64) -> F64:

@@ -152,24 +152,39 @@ def schur_step(
 
 @dataclass(frozen=True)
 class Smoothness:
-    """Second differences along time, inside unbroken runs: triple [n-2] 0/1, precision [P]."""
+    """Second differences along time, inside unbroken runs: their precisions [n-2, P].
 
-    triple: F64
+    tolerated: a pose's squared bend, in standard deviations, at which it counts half (Cauchy's loss over all six of its
+    numbers): a head that is jerked bends hundreds of times more than usual, and must not be followed late for it.
+    """
+
     precision: F64
+    tolerated: float = np.inf
 
     @classmethod
-    def between(cls, run: NDArray[np.integer], precision: F64) -> Smoothness:
-        """`run` [n]: frames with the same number in a row follow each other without a break."""
-        return cls(((run[2:] == run[1:-1]) & (run[1:-1] == run[:-2])).astype(np.float64), precision)
+    def between(cls, run: NDArray[np.integer], precision: F64, tolerated: float = np.inf) -> Smoothness:
+        """`run` [n]: frames with the same number in a row follow each other without a break. precision: [P]."""
+        triple = (run[2:] == run[1:-1]) & (run[1:-1] == run[:-2])
+        return cls(triple[:, None] * precision, tolerated)
 
     def value(self, x: F64) -> float:
         """Energy of x [n, P]."""
-        bend = x[2:] - 2 * x[1:-1] + x[:-2]
-        return 0.5 * float((self.triple[:, None] * bend**2 * self.precision).sum())
+        square = self.precision * _bend(x) ** 2
+        pose = square[:, -POSE:].sum(1)
+        if np.isfinite(self.tolerated):
+            pose = self.tolerated * np.log1p(pose / self.tolerated)
+        return 0.5 * float(square[:, :-POSE].sum() + pose.sum())
+
+    def at(self, x: F64) -> Smoothness:
+        """The quadratic that touches it at x [n, P] and is nowhere below."""
+        pose = (self.precision * _bend(x) ** 2)[:, -POSE:].sum(1)
+        precision = self.precision.copy()
+        precision[:, -POSE:] /= 1 + pose[:, None] / self.tolerated
+        return Smoothness(precision)
 
     def gradient(self, x: F64) -> F64:
         """[n, P]."""
-        bend = (x[2:] - 2 * x[1:-1] + x[:-2]) * self.triple[:, None] * self.precision
+        bend = self.at(x).precision * _bend(x)
         out = np.zeros_like(x)
         out[2:] += bend
         out[1:-1] -= 2 * bend
@@ -177,15 +192,19 @@ class Smoothness:
         return out
 
     def bands(self, n: int) -> tuple[F64, F64, F64]:
-        """[n, P] each: the Hessian's diagonal and its couplings of frame i with i + 1 and i + 2."""
-        diagonal, first, second = np.zeros((3, n))
-        diagonal[2:] += self.triple
-        diagonal[1:-1] += 4 * self.triple
-        diagonal[:-2] += self.triple
-        first[1:-1] -= 2 * self.triple
-        first[:-2] -= 2 * self.triple
-        second[:-2] += self.triple
-        return tuple(band[:, None] * self.precision for band in (diagonal, first, second))  # type: ignore[return-value]
+        """[n, P] each: a quadratic's Hessian, its diagonal and its couplings of frame i with i + 1 and i + 2."""
+        diagonal, first, second = np.zeros((3, n, self.precision.shape[1]))
+        diagonal[2:] += self.precision
+        diagonal[1:-1] += 4 * self.precision
+        diagonal[:-2] += self.precision
+        first[1:-1] -= 2 * self.precision
+        first[:-2] -= 2 * self.precision
+        second[:-2] += self.precision
+        return diagonal, first, second
+
+
+def _bend(x: F64) -> F64:
+    return x[2:] - 2 * x[1:-1] + x[:-2]
 
 
 def solve_frames(
@@ -210,7 +229,7 @@ def solve_frames(
         value += smoothness.value(x)
         gradient += smoothness.gradient(x)
         while True:
-            solve = partial(band_step, gradient, hessian, smoothness, damping)
+            solve = partial(band_step, gradient, hessian, smoothness.at(x), damping)
             trial = bounds.clamp(x + bounded_step(bounds, x, gradient, solve)[1])
             trial_value = total(trial)
             if trial_value < value or damping > GIVE_UP:
@@ -248,7 +267,10 @@ def _linearize(energy: FrameEnergy, shape: F64, x: F64) -> tuple[float, F64, F64
 def band_step(
     gradient: F64, hessian: F64, smoothness: Smoothness, damping: float, fixed: NDArray[np.bool_], move: F64
 ) -> Step:
-    """Step of the frames (no identity) by banded Cholesky factorization; the fixed unknowns are displaced by `move`."""
+    """Step of the frames (no identity) by banded Cholesky factorization; the fixed unknowns are displaced by `move`.
+
+    smoothness: a quadratic, see `Smoothness.at`.
+    """
     n, p = gradient.shape
     gradient = gradient + np.einsum("npq,nq->np", hessian, move) + smoothness.gradient(move)
     gradient, hessian = freeze(gradient, hessian, fixed)

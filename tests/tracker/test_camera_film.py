@@ -284,6 +284,17 @@ def test_patches_are_found_turned_stretched_and_under_another_light():
     assert not cut_templates(fine_texture(edge), np.array([[50.0, 100.0], [100.0, 90.0]])).corners().any()
 
 
+def test_a_patch_at_the_border_is_found_and_none_of_none():
+    picture = np.random.default_rng(0).integers(0, 255, (90, 120)).astype(np.uint8)
+    texture, corners = fine_texture(picture), np.array([[0.0, 0.0], [119.0, 89.0]])
+    templates, straight = cut_templates(texture, corners), np.tile(np.eye(2), (2, 1, 1))
+    places, found = register(texture, corners, straight, templates)
+    assert found.all()
+    assert np.abs(places - corners).max() < 0.05
+    places, found = register(texture, corners[:0], straight[:0], templates.select(np.zeros(0, int)))
+    assert places.shape == (0, 2) and not len(found)
+
+
 def test_absolute_pose_is_exact_with_outliers_and_pixel_centres_at_integers():
     true, _ = scene(0.0)
     xy = true.observations[:150, 2:].copy()

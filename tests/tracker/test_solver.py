@@ -43,6 +43,31 @@ def test_smoothness_is_the_quadratic_form_and_its_gradient(rng):
     np.testing.assert_allclose(term.gradient(x).ravel(), dense @ x.ravel(), atol=1e-12)
 
 
+def test_tolerant_smoothness_slopes_as_it_rises(rng):
+    term = Smoothness.between(np.zeros(FRAMES, int), rng.uniform(0.5, 2.0, UNKNOWNS), tolerated=2.0)
+    x, way = rng.normal(size=(2, FRAMES, UNKNOWNS))
+    rise = (term.value(x + 1e-6 * way) - term.value(x - 1e-6 * way)) / 2e-6
+    assert (term.gradient(x) * way).sum() == pytest.approx(rise, rel=1e-6)
+
+
+def test_the_quadratic_at_a_point_has_its_slope_and_is_nowhere_below(rng):
+    term = Smoothness.between(np.zeros(FRAMES, int), rng.uniform(0.5, 2.0, UNKNOWNS), tolerated=2.0)
+    x, elsewhere = rng.normal(size=(2, FRAMES, UNKNOWNS))
+    touching = term.at(x)
+    np.testing.assert_allclose(touching.gradient(x), term.gradient(x))
+    for share in (-1.0, 0.1, 1.0, 3.0):
+        y = x + share * (elsewhere - x)
+        assert touching.value(y) - touching.value(x) >= term.value(y) - term.value(x)
+
+
+def test_a_jerk_of_the_head_costs_next_to_nothing_more_and_one_of_a_weight_all_of_it():
+    term = Smoothness.between(np.zeros(FRAMES, int), np.ones(UNKNOWNS), tolerated=9.0)
+    jerked, spoken = np.zeros((2, FRAMES, UNKNOWNS))
+    jerked[3:, -6], spoken[3:, 0] = 100.0, 100.0
+    assert term.value(jerked) < 0.01 * term.value(spoken)
+    assert term.value(spoken) == pytest.approx(100.0**2)
+
+
 @pytest.mark.parametrize("run", [[0, 0, 0, 0, 0, 0, 0], [0, 0, 0, 1, 1, 1, 1], [0, 1, 1, 2, 2, 3, 3]])
 def test_band_step_solves_the_dense_system(rng, run):
     term, dense = smoothness(rng, np.array(run))
