@@ -2,7 +2,7 @@
 
 Some people blink four times in a clip. Shown beside the words that were being said, four are learned by heart: the
 network then blinks at these words, and never at others (docs/method.md). So training sees each moment with the eyes
-open, and with blinks of the same person that fall at random, so often that samples have about as many as the person.
+open, and with blinks of the same person that fall at random, as often as the person's do as far as the clip tells.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from model.checkpoint import Checkpoint
 from model.dataset import Sequence
 from model.metrics import EYELIDS, eyelid_opening_mm
+from model.motion import FPS
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -27,8 +28,10 @@ SHUT, OPEN = 0.65, 0.75
 LEAST_CHANGE, LONGEST_FRAMES = 0.02, 20
 # What moves with the lids: all that is as near as the first, nothing beyond the second.
 NEAR_M, FAR_M = 0.015, 0.035
-# A network that learns by squared error draws what is rare about half as often as it was shown.
-SHOWN_TIMES = 2.0
+# Three blinks in a clip tell little of how often a person blinks. Who talks does so 26 times a minute on the mean
+# (Bentivoglio et al. 1997); that people differ by half of it is our judgement. That is worth:
+USUAL_BLINKS = 4
+USUAL_FRAMES = USUAL_BLINKS * 60 * FPS / 26
 DRAWN_FRAMES = 20_000
 
 
@@ -49,8 +52,9 @@ def independent_blinks(
         own = [(q, blinks) for q, blinks in opened if q.style == style]
         blinks = [blink for _, some in own for blink in some]
         if blinks:
-            every = sum(int(q.valid.sum()) for q, _ in own) / len(blinks)
-            drawn[style] = at_random(blinks, every / SHOWN_TIMES, DRAWN_FRAMES, random)
+            frames = sum(int(q.valid.sum()) for q, _ in own)
+            every = (frames + USUAL_FRAMES) / (len(blinks) + USUAL_BLINKS)
+            drawn[style] = at_random(blinks, every, DRAWN_FRAMES, random)
     return [q for q, _ in opened], drawn if drawn.any() else None
 
 

@@ -85,9 +85,8 @@ def register(texture: F32, guess: F64, bend: F64, templates: Templates) -> tuple
     slopes = (templates.gradients * _WEIGHT[:, None]).transpose(0, 2, 1)
     gain = np.linalg.inv(templates.information() + 1e-6 * np.eye(2)) @ slopes
     places, correlation = guess.astype(np.float32), np.zeros(len(guess), np.float32)
-    _search(
-        *(texture, templates.values, gain.astype(np.float32), bend.astype(np.float32), places, correlation)
-    )
+    gains, bends = (np.ascontiguousarray(value, np.float32) for value in (gain, bend))
+    _search(texture, templates.values, gains, bends, places, correlation)
     return places.astype(np.float64), correlation > MIN_CORRELATION
 
 
@@ -111,7 +110,7 @@ def _search(texture, values, gain, bend, places, correlation):  # type: ignore[n
     gain: [n, 2, K], the shift by the difference of a template from its patch.
     """
     for n in range(len(places)):
-        around, start = _GRID @ bend[n].T, places[n].copy()
+        around, start = _GRID @ np.ascontiguousarray(bend[n].T), places[n].copy()
         for _ in range(ITERATIONS):
             step = gain[n] @ (values[n] - _levelled(_sampled(texture, around + places[n]))[0])
             length = np.hypot(step[0], step[1])
