@@ -20,7 +20,8 @@ from tracker.view import U8, Index
 if TYPE_CHECKING:
     from tracker.head import HeadModel
 
-KEYS = 48  # frames, spread over the clip, that tell the albedo
+KEYS = 12, 48  # frames, spread over the clip, that tell the albedo: so many at least and at most,
+KEYS_APART = 3  # and no closer than this, since neighbours say the same and each costs as much as three fits
 STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
 HALFWAY = 0.5  # to the bundle's poses: grey levels err as much, but slowly, and the tracks at random
 HELD_BYTES = 256 << 20  # of cut-out faces, about 100 s of them; a longer clip is read twice instead
@@ -114,7 +115,8 @@ def _looked_at(
 
     A short clip's pictures are read once.
     """
-    keys = set(np.linspace(0, len(good) - 1, KEYS).round().astype(int).tolist())
+    count = int(np.clip(len(good) // KEYS_APART, *KEYS))
+    keys = set(np.linspace(0, len(good) - 1, count).round().astype(int).tolist())
     short = len(good) * subject.window.size[0] * subject.window.size[1] <= HELD_BYTES
     held: dict[int, U8] = {}
     colours: dict[int, U8] = {}
