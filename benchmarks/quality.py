@@ -9,6 +9,7 @@ r               of the lip opening with the reference: mean of 10 samples at s =
                 same speech features on the same seconds; `training` is on the training seconds
 sd              over samples at s = 0.5 by the motion's own: lip opening, mouth width, eyelid opening
 speed           mean change from frame to frame of the same three, by the subject's own: noise is no variety
+blinks          a minute, of samples; behind it the subject's own in what is tested and in what is learned from
 spread, velocity    of samples, by the subject's own; at s = 0 without the speech
 
 The second table (--curve) is the guidance curve: div_e and lip_sync for s = 0 ... 1.
@@ -24,11 +25,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from model.blinks import blink_spans
 from model.checkpoint import Checkpoint
 from model.dataset import Sequence
 from model.diffusion import STEPS
 from model.finetuning import EARLY_TOLERANCE, SWEEP, choose_checkpoint, subject_of
 from model.metrics import eyelid_opening_mm, lip_gap_r, lip_opening_mm, score
+from model.motion import FPS
 from model.ridge import Ridge
 from model.speech import load_encoder
 from model.synthesis import synthesize
@@ -75,6 +78,16 @@ def together(checkpoint: Checkpoint, drawn: list[F32], sequences: list[Sequence]
     return figures
 
 
+def blinks_a_minute(checkpoint: Checkpoint, drawn: list[F32], sequences: list[Sequence]) -> float:
+    """Of samples [S, N, K] of each sequence, over the valid frames of all."""
+    count = sum(
+        len(blink_spans(signals(checkpoint, sample)["lids"], q.valid))
+        for samples, q in zip(drawn, sequences)
+        for sample in samples
+    )
+    return 60 * FPS * count / sum(len(d) * int(q.valid.sum()) for d, q in zip(drawn, sequences))
+
+
 def draw(checkpoint: Checkpoint, sequences: list[Sequence], s: float, samples: int, steps: int) -> list[F32]:
     """Samples [S, N, K] of each sequence."""
     return [
@@ -88,7 +101,11 @@ def report(
 ) -> None:
     """The first table."""
     predicted = together(checkpoint, [ridge.predict(q.features)[None] for q in test], test)
-    at = {s: together(checkpoint, draw(checkpoint, test, s, SAMPLES, steps), test) for s in (0.0, 0.5, 1.0)}
+    samples = {s: draw(checkpoint, test, s, SAMPLES, steps) for s in (0.0, 0.5, 1.0)}
+    at = {s: together(checkpoint, drawn, test) for s, drawn in samples.items()}
+    own, learned = (
+        blinks_a_minute(checkpoint, [q.coefficients[None] for q in qs], qs) for qs in (test, train)
+    )
     longest = sorted(train, key=lambda q: -len(q.valid))[:4]
     known = together(checkpoint, draw(checkpoint, longest, 1.0, 3, steps), longest)
     print(f"r     mean of {SAMPLES}, s = 1: {at[1.0]['r']:.3f}   ridge {predicted['r']:.3f}", end="   ")
@@ -98,7 +115,8 @@ def report(
             "   ".join(f"{name} {row[f'{kind} {name}']:.2f}" for name in SIGNALS) for kind in ("sd", "speed")
         )
         print(f"s = {s}   sd {sds}   speed {speeds}", end="   ")
-        print(f"spread {row['spread']:.2f}   velocity {row['velocity']:.2f}")
+        print(f"spread {row['spread']:.2f}   velocity {row['velocity']:.2f}", end="   ")
+        print(f"blinks {blinks_a_minute(checkpoint, samples[s], test):.1f} ({own:.1f}, {learned:.1f})")
     print(f"ridge     spread {predicted['spread']:.2f}   velocity {predicted['velocity']:.2f}", flush=True)
 
 

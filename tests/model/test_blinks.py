@@ -50,6 +50,16 @@ def opening(checkpoint: Checkpoint, coefficients: np.ndarray) -> np.ndarray:
     return eyelid_opening_mm(checkpoint.template, checkpoint.basis, checkpoint.regions, coefficients)
 
 
+def test_opening_of_the_eyes_by_hand() -> None:
+    """Lids 10 mm apart at rest; one eye's upper lid comes down by 4 mm: the mean of both eyes is 8."""
+    checkpoint, shut = eyes()
+    assert opening(checkpoint, 0 * shut) == pytest.approx(OPEN_MM)
+    assert opening(checkpoint, np.stack([3 * shut, OPEN_MM * shut])) == pytest.approx([7.0, 0.0], abs=1e-4)
+    one = checkpoint.template.copy()
+    one[6, 1] -= 0.004
+    assert opening(replace(checkpoint, template=one), 0 * shut) == pytest.approx(8.0)
+
+
 def test_a_blink_is_found_from_its_first_frame_to_its_last() -> None:
     curve, valid = np.full(400, OPEN_MM), np.ones(400, bool)
     for first in (30, 100, 395):  # the last one does not end
