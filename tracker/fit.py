@@ -205,8 +205,13 @@ def resume(
     energy = _energy(model, weights, camera, observed, camera.focal_px / translation[:, 2], x)
     energy = replace(energy, visible=energy.visible * _share(evidence, good)[:, None])
     if len(good):
-        energy = with_lips_shut(energy, x, key_frames(observed, energy.px_per_m)[0])
+        energy = with_lips_shut(energy, x, at_rest(observed, energy.px_per_m, trusted(evidence, good)))
     return energy, x, observed, good
+
+
+def at_rest(observed: F64, px_per_m: F64, sound: Frames) -> Frames:
+    """Of the rows `sound` of landmarks [n, 478, 2] px those at rest, as `key_frames` chooses them."""
+    return sound[key_frames(observed[sound], px_per_m[sound])[0]]
 
 
 def make_track(

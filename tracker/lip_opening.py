@@ -39,7 +39,7 @@ OPEN_MM = 2.5  # lips farther apart than this show what is inside
 # wider still, by about a tenth.
 LIP_MARGIN_MM, INSIDE_MARGIN_MM, INSIDE_SHARE = 0.5, 0.8, 0.15
 LEAST_INSIDE = 100  # samples; with fewer the clip hardly shows an open mouth
-MISTAKEN = 0.12  # share of what is inside that looks more like lips: above, the clip's colours tell nothing
+MISTAKEN = 0.25  # share of what is inside that looks more like lips: above, the clip's colours tell nothing
 DOUBT = 1.0  # log likelihood ratio up to which a colour tells nothing: a tongue is nearly that of lips
 TRUSTED = 3.0  # the most that one sample counts, as log likelihood ratio
 PRIOR_MM = 1.0  # standard deviation of width and middle about the landmarks'
@@ -92,13 +92,15 @@ class LipLines:
         return out
 
 
-def lip_widths(colours: U8, marks: F64) -> F64 | None:
+def lip_widths(colours: U8, marks: F64, sound: Index) -> F64 | None:
     """[n, Q] mm between the lips, of colours [n, Q, S, 3] u8 along lines with the landmarks' marks [n, Q, 4].
 
-    The expectation over all places of both edges, under the colours' classes and a weak prior about the landmarks. None
-    where the clip's colours do not tell lips from what is between them.
+    The expectation over all places of both edges, under the colours' classes and a weak prior about the landmarks.
+    sound: rows whose colours are the face's own. None where they do not tell lips from what is between them.
     """
-    learned = np.unique(np.linspace(0, len(colours) - 1, LEARNED).round().astype(int))
+    if not len(sound):
+        return None
+    learned = sound[np.unique(np.linspace(0, len(sound) - 1, LEARNED).round().astype(int))]
     axes = _colour_axes(colours[learned], marks[learned])
     low, high = np.quantile(axes.reshape(-1, 3), (0.005, 0.995), axis=0)
     scale = BINS / np.maximum(high - low, LEAST_RANGE)

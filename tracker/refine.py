@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.fit import make_track, resume, runs, smoothness_between, trusted, with_lips_shut
-from tracker.key_frames import key_frames
+from tracker.fit import at_rest, make_track, resume, runs, smoothness_between, trusted, with_lips_shut
 from tracker.lip_opening import LipLines, lip_widths
 from tracker.rigid_pose import hold_poses
 from tracker.skin_fit import Photometry, Subject, fit_openings, fit_stretch, learn_levels
@@ -66,16 +65,18 @@ def refine_track(
     unknown = np.full((len(track.time), 2), np.nan, np.float32)
     if not len(good):
         return Refined(track, unknown)
+    sound = trusted(evidence, good)
     subject = Subject.of(head, track.identity, energy, photometry)
     lines = LipLines.across(observed, energy.px_per_m, x)
-    keys, cuts, colours = _looked_at(subject, lines, camera, frames, good)
+    keys, cuts, colours = _looked_at(subject, lines, camera, frames, good, sound)
     if not keys:
         return Refined(track, unknown)
     rows = np.array(list(colours))
-    widths = lip_widths(np.stack(list(colours.values())), lines.marks[rows])
+    bare = np.flatnonzero(np.isin(rows, sound))
+    widths = lip_widths(np.stack(list(colours.values())), lines.marks[rows], bare)
     if widths is not None:
         observed = lines.opened(observed, rows, widths)
-        subject = _with_landmarks(subject, observed, x)
+        subject = _with_landmarks(subject, observed, x, sound)
         smoothness = smoothness_between(subject.energy, landmarks.time, good[rows], segment)
         x[rows] = fit_openings(subject, rows, x[rows], smoothness)
     rows = np.array(list(keys))
@@ -95,28 +96,37 @@ def refine_track(
         if progress:
             progress(min(start + STRETCH, len(good)), len(good))
     if camera.method != "prior":
-        refined = hold_poses(refined, bundle, good, runs(good, segment), trusted(evidence, good), HALFWAY)
+        refined = hold_poses(refined, bundle, good, runs(good, segment), sound, HALFWAY)
     identity = track.identity.astype(np.float64)
     out = make_track(landmarks, camera, head, subject.energy, observed, identity, refined, good)
     return Refined(out, _relative(deviation, good, len(track.time)))
 
 
-def _with_landmarks(subject: Subject, observed: F64, x: F64) -> Subject:
-    """The subject whose landmarks lie at observed [n, 478, 2] px; of x [n, U] the rotations are read."""
+def _with_landmarks(subject: Subject, observed: F64, x: F64, sound: Index) -> Subject:
+    """The subject whose landmarks lie at observed [n, 478, 2] px, and are believed in the rows `sound`.
+
+    x: [n, U], of which the rotations are read.
+    """
     energy = replace(subject.energy, observed=observed[:, subject.energy.model.landmarks])
-    rest = key_frames(observed, energy.px_per_m)[0]
+    rest = at_rest(observed, energy.px_per_m, sound)
     return replace(subject, energy=with_lips_shut(energy, x, rest))
 
 
 def _looked_at(
-    subject: Subject, lines: LipLines, camera: Camera, frames: Callable[[], Iterable[Frame]], good: Index
+    subject: Subject,
+    lines: LipLines,
+    camera: Camera,
+    frames: Callable[[], Iterable[Frame]],
+    good: Index,
+    sound: Index,
 ) -> tuple[dict[int, U8], Iterable[tuple[int, U8]], dict[int, U8]]:
-    """By rows: cut-out faces of the key frames, and of all frames `good`, and these frames' colours along the lines.
+    """By rows: cut-out faces of key frames among `sound`, and of all frames `good`, and these frames' colours along the
+    lines.
 
     A short clip's pictures are read once.
     """
-    count = int(np.clip(len(good) // KEYS_APART, *KEYS))
-    keys = set(np.linspace(0, len(good) - 1, count).round().astype(int).tolist())
+    count = int(np.clip(len(sound) // KEYS_APART, *KEYS))
+    keys = set(sound[np.linspace(0, len(sound) - 1, count).round().astype(int)].tolist())
     short = len(good) * subject.window.size[0] * subject.window.size[1] <= HELD_BYTES
     held: dict[int, U8] = {}
     colours: dict[int, U8] = {}

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tracker.energy import LIP_PAIRS, Weights, landmark_model
-from tracker.fit import fit_track
+from tracker.fit import fit_track, resume
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, INNER_LIP_LOWER, POINTS
 from tracker.track import Bundle, Camera, Landmarks, TrackError
@@ -137,6 +137,28 @@ def test_shut_lips_read_shut_though_the_landmarker_keeps_them_apart():
     assert shut.sum() > 10
     assert np.median(track.lip_gap_mm[shut]) < 0.3
     assert np.sqrt(np.mean((track.lip_gap_mm - talker.gap) ** 2)) < 0.6
+
+
+def test_shut_lips_are_read_in_bare_frames():
+    talker = Talker(120, seed=2, noise=0.001)
+    points = talker.landmarks.points.copy()
+    # What a hand over the mouth shows as lips: shut in the middle and crossed beside it.
+    points[40:60, 14] = points[40:60, 13]
+    points[40:60, [upper for upper, _ in LIP_PAIRS if upper != 13], 1] += 0.003 * FOCAL / DISTANCE
+    covered = replace(talker.landmarks, points=points)
+    evidence = np.ones(120, np.float32)
+    evidence[40:60] = 0
+    track = talker.fit(landmarks=covered, evidence=evidence)
+    touch = {
+        name: resume(track, landmarks, CAMERA, HEAD, told)[0].model.touch
+        for name, landmarks, told in (
+            ("bare", talker.landmarks, None),
+            ("told", covered, evidence),
+            ("untold", covered, None),
+        )
+    }
+    assert np.abs(touch["told"] - touch["bare"]).max() < 0.0003
+    assert np.abs(touch["untold"] - touch["bare"]).max() > 0.0006
 
 
 def test_lips_and_lids_do_not_pass_each_other():

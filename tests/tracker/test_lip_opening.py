@@ -8,6 +8,7 @@ from tracker.landmark_indices import POINTS
 from tracker.lip_opening import OUTER_PAIRS, SAMPLES, LipLines, lip_widths
 
 FRAMES, LIP_MM = 80, 7.0
+ALL = np.arange(FRAMES)
 UPPER, LOWER, TOOTH, DARK, SKIN = (
     (150, 80, 80),
     (180, 100, 95),
@@ -47,14 +48,14 @@ def openings() -> tuple[np.ndarray, np.ndarray]:
 
 def test_colours_halve_the_landmarks_error(openings: tuple[np.ndarray, np.ndarray]):
     true, seen = openings
-    widths = lip_widths(painted(true), marked(seen))
+    widths = lip_widths(painted(true), marked(seen), ALL)
     assert (widths - true).std() < 0.5 * (seen - true).std()
     assert np.corrcoef(widths.ravel(), true.ravel())[0, 1] > 0.99
 
 
 def test_shut_lips_stay_shut(openings: tuple[np.ndarray, np.ndarray]):
     true, seen = openings
-    widths = lip_widths(painted(true), marked(seen))
+    widths = lip_widths(painted(true), marked(seen), ALL)
     assert widths[true == 0].max() < seen[true == 0].min() + 0.2
 
 
@@ -62,20 +63,30 @@ def test_light_changes_nothing(openings: tuple[np.ndarray, np.ndarray]):
     true, seen = openings
     dim = np.where(np.arange(FRAMES)[:, None, None, None] % 20 < 10, painted(true), painted(true, gain=0.6))
     np.testing.assert_allclose(
-        lip_widths(dim, marked(seen)), lip_widths(painted(true), marked(seen)), atol=0.5
+        lip_widths(dim, marked(seen), ALL), lip_widths(painted(true), marked(seen), ALL), atol=0.5
     )
 
 
 def test_nothing_is_told_without_a_difference(openings: tuple[np.ndarray, np.ndarray]):
     true, seen = openings
-    assert lip_widths(np.zeros_like(painted(true)), marked(seen)) is None
-    assert lip_widths(painted(true, inside=(UPPER, LOWER)), marked(seen)) is None
+    assert lip_widths(np.zeros_like(painted(true)), marked(seen), ALL) is None
+    assert lip_widths(painted(true, inside=(UPPER, LOWER)), marked(seen), ALL) is None
 
 
 def test_a_mouth_that_never_opens_tells_nothing():
     shut = np.full((FRAMES, 9), 0.4)
-    assert lip_widths(painted(0 * shut), marked(shut)) is None
-    assert lip_widths(painted(0 * shut)[:1], marked(shut)[:1]) is None
+    assert lip_widths(painted(0 * shut), marked(shut), ALL) is None
+    assert lip_widths(painted(0 * shut)[:1], marked(shut)[:1], ALL[:1]) is None
+
+
+def test_what_covers_the_mouth_teaches_nothing(openings: tuple[np.ndarray, np.ndarray]):
+    true, seen = openings
+    bare = ALL[: FRAMES // 2]
+    hand = painted(true)
+    hand[FRAMES // 2 :] = (200, 150, 125)
+    alone = lip_widths(painted(true)[bare], marked(seen)[bare], bare)
+    np.testing.assert_allclose(lip_widths(hand, marked(seen), bare)[bare], alone)
+    assert lip_widths(hand, marked(seen), ALL[:0]) is None
 
 
 def face() -> np.ndarray:
