@@ -40,8 +40,8 @@ def independent_blinks(
 ) -> tuple[list[Sequence], F32 | None]:
     """The sequences without their blinks, and blinks at random moments, [S, N, K] m for the checkpoint's S styles.
 
-    Where the mesh names no eyelids, or nobody blinks, the sequences as they are and None; so for a base model, which sees
-    many people's many blinks beside no words of their own.
+    Where the mesh names no eyelids, or nobody blinks, the sequences as they are and None; so for a base model: it sees
+    too many blinks to learn them by heart.
     """
     if checkpoint.kind == "base" or not all(name in checkpoint.regions for pair in EYELIDS for name in pair):
         return list(sequences), None
