@@ -22,7 +22,7 @@ from personalize.feature_cache import cache_folder
 from personalize.files import sha256_json
 from personalize.render import mouth
 from personalize.talkers.motion import TalkerMotion
-from personalize.talkers.skin import backdrop, painted, skin_block, texture
+from personalize.talkers.skin import backdrop, skin_block, texture
 from personalize.video_writer import VideoWriter
 from tracker import raster
 from tracker.head import HeadModel
@@ -203,7 +203,7 @@ def _prop_paint(prop: props.Prop, scene: Scene) -> F64:
 
 def _painted(person: HeadModel, scene: Scene) -> F64:
     """[D, 3] the person's albedo: skin, hair, stubble."""
-    albedo = painted(person).astype(np.float64)
+    albedo = person.albedo.astype(np.float64)
     skin_parts = np.ones(len(albedo), bool)
     skin_parts[np.concatenate([person.regions["eyes"], mouth.within(person)])] = False
     albedo[skin_parts] *= scene.skin

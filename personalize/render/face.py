@@ -22,8 +22,6 @@ FACE_SHARE_OF_HEIGHT = 0.72
 CLAY = (205, 186, 174)
 TURN_DEG = -12.0
 SUPERSAMPLING = 2
-LIP_COLOUR = 0.75  # share of the head's own, which is a lipstick's
-LIGHT_REACH_M = 0.01  # into the mouth, to 1 / e
 CREASES_SEED = 0
 
 
@@ -54,7 +52,7 @@ class FaceCamera:
         if self._person is None:
             self._template, self._albedo = template, np.tile(np.asarray(CLAY, np.uint8), (len(template), 1))
         else:
-            self._template, self._albedo = self._person.template, _painted(self._person)
+            self._template, self._albedo = self._person.template, mouth.painted(self._person)
             self._detail = mouth.MouthDetail.of(self._person, len(template), CREASES_SEED)
 
     def picture(self, displacement: F32) -> U8:
@@ -78,18 +76,3 @@ def _embedded(template: F32, faces: NDArray[np.int32]) -> HeadModel | None:
     if topology_hash(len(template), faces) != topology_hash(len(head.template), head.faces):
         return None
     return mouth.furnished(replace(head, template=template))
-
-
-def _painted(person: HeadModel) -> U8:
-    """[D, 3] RGB: the head's own paint with paler lips, and a mouth that is darker the deeper."""
-    albedo = person.albedo.astype(np.float64)
-    face = person.regions["face"]
-    tone, redness = np.median(albedo[face], axis=0), albedo[face, 0] - albedo[face, 1]
-    red = face[redness > tone[0] - tone[1]]
-    albedo[red] = tone + LIP_COLOUR * (albedo[red] - tone)
-    mouth.paint(albedo, person)
-    inside = mouth.within(person)
-    depth = person.template[person.regions["teeth"], 2].max() - person.template[inside, 2]
-    # Colours are square roots of light, as in tracker.raster.
-    albedo[inside] *= np.exp(-0.5 * np.maximum(depth, 0) / LIGHT_REACH_M)[:, None]
-    return albedo.astype(np.uint8)

@@ -37,6 +37,8 @@ CREASE_M, CREASES = 0.0008, 0.03
 # Light that is lost behind what surrounds a point, by the size of the surroundings.
 CREVICES_M, CREVICE_LOSS, DEEPEST = (0.001, 0.0025, 0.006), 0.9, 2.5
 AROUND_M = 0.015
+LIP_COLOUR = 0.75  # share of the head's own, which is a lipstick's
+LIGHT_REACH_M = 0.01  # into the mouth, to 1 / e
 
 
 def furnished(person: HeadModel) -> HeadModel:
@@ -76,6 +78,21 @@ def within(person: HeadModel) -> NDArray[np.int32]:
     return np.concatenate(
         [person.regions[part] for part in ("mouth", "teeth", "tongue")] + [person.behind_lips()]
     )
+
+
+def painted(person: HeadModel) -> U8:
+    """[D, 3] RGB: the head's own paint with paler lips, and a mouth that is darker the deeper."""
+    albedo = person.albedo.astype(np.float64)
+    face = person.regions["face"]
+    tone, redness = np.median(albedo[face], axis=0), albedo[face, 0] - albedo[face, 1]
+    red = face[redness > tone[0] - tone[1]]
+    albedo[red] = tone + LIP_COLOUR * (albedo[red] - tone)
+    paint(albedo, person)
+    inside = within(person)
+    depth = person.template[person.regions["teeth"], 2].max() - person.template[inside, 2]
+    # Colours are square roots of light, as in tracker.raster.
+    albedo[inside] *= np.exp(-0.5 * np.maximum(depth, 0) / LIGHT_REACH_M)[:, None]
+    return albedo.astype(np.uint8)
 
 
 def paint(albedo: F64, person: HeadModel) -> None:
