@@ -14,18 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks import ground_truth, mouths, props, rendered_heads
+from benchmarks import ground_truth, props, rendered_heads
 from benchmarks.ground_truth import GroundTruth
 from benchmarks.rendered_heads import FPS, Scene, scene_motion, stranger
 from personalize import talkers, video_writer
 from personalize.feature_cache import cache_folder
 from personalize.files import sha256_json
+from personalize.render import mouth
 from personalize.talkers.motion import TalkerMotion
-from personalize.talkers.skin import backdrop, painted, skin_block, texture
+from personalize.talkers.skin import backdrop, skin_block, texture
 from personalize.video_writer import VideoWriter
 from tracker import raster
 from tracker.head import HeadModel
-from tracker.raster import Raster, project, rasterize, shade, vertex_normals
+from tracker.raster import project, rasterize, shade, vertex_normals
 from tracker.track import F32, F64
 
 U8 = NDArray[np.uint8]
@@ -34,11 +35,13 @@ LENS_BLUR_PX = 0.6
 SHININESS = 12.0
 SHORT_PX = 0.5  # a movement during the exposure that blurs nothing
 IN_MOUTH = 0.5  # share of the key light
+LIP = np.array([176.0, 92.0, 88.0])
+PALENESS = (0.5, 0.85)  # how far lips are from skin to the head's own red
 LIP_GLOSS = 1.8  # of the skin's
 LIP_SOFTNESS = 0.4
 HAND_COLOUR = (205.0, 165.0, 148.0)
 MADE_BY = (
-    *(module.__file__ for module in (ground_truth, mouths, props, rendered_heads, raster, video_writer)),
+    *(module.__file__ for module in (ground_truth, mouth, props, rendered_heads, raster, video_writer)),
     *sorted(str(path) for path in Path(talkers.__path__[0]).glob("*.py")),
     __file__,
 )
@@ -62,7 +65,7 @@ def film(scene: Scene, head: HeadModel) -> tuple[Path, GroundTruth]:
 
 def shoot(scene: Scene, head: HeadModel, path: Path) -> GroundTruth:
     """Render a scene to the video `path`."""
-    person, moves = mouths.furnished(stranger(head, scene)), scene_motion(scene)
+    person, moves = mouth.furnished(stranger(head, scene)), scene_motion(scene)
     weights = moves.expression_for(person.expression_names)
     studio = _Studio(scene, person, moves)
     covered, gaps = np.zeros(len(weights)), np.zeros(len(weights))
@@ -105,7 +108,7 @@ class _Studio:
             first += len(prop.vertices)
         self._faces = np.concatenate(parts).astype(np.int32)
         self._own = len(parts[0])
-        self._inside = mouths.within(person)
+        self._inside = mouth.within(person)
         self._albedo = np.concatenate(
             [_painted(person, scene), *(_prop_paint(prop, scene) for prop in self._props)]
         )
@@ -116,12 +119,15 @@ class _Studio:
         self._gloss[person.regions["lips"]] = LIP_GLOSS
         self._soft = np.zeros((len(self._places), 1))
         self._soft[person.regions["lips"]] = LIP_SOFTNESS
-        self._detail = mouths.MouthDetail.of(person, len(self._places), scene.seed)
+        self._detail = mouth.MouthDetail.of(person, len(self._places), scene.seed)
         noses = self._turns.apply(person.template[person.regions["face"]].mean(0)) + moves.translation
         self._path = project(noses, scene.focal * max(scene.size), (0, 0))
 
     def picture(self, frame: int, vertices: F32) -> tuple[U8, float]:
-        """What the camera records of vertices [D, 3] m in the head frame, and the share of the lips covered."""
+        """What the camera records of vertices [D, 3] m in the head frame, and the share of the lips covered.
+
+        Lips outside the picture count as covered where none are in it.
+        """
         whole = np.concatenate([vertices, *(prop.at(frame / FPS) for prop in self._props)])
         posed = (self._turns[frame].apply(whole) + self._moves.translation[frame]).astype(np.float32)
         centre = [(side - 1) / 2 for side in self._large]
@@ -138,13 +144,11 @@ class _Studio:
         texture(around, seen, self._faces, self._places, self._block)
         lips = pixels[self._person.regions["lips"], :2]
         scale = self._focal / float(posed[self._person.regions["lips"], 2].mean())
-        part = mouths.window(lips, (right - left, bottom - top), scale)
-        part_seen = Raster(seen.triangle[part], seen.barycentric[part], seen.depth[part])
-        self._detail.lay(around[part], part_seen, self._faces, scale)
+        self._detail.lay(around, seen, self._faces, lips, scale)
         lips = lips.round().astype(int)
         inside = ((lips >= 0) & (lips < seen.triangle.shape[::-1])).all(1)
-        covered = float((seen.triangle[lips[inside, 1], lips[inside, 0]] >= self._own).mean())
-        return self._exposed(picture, frame), covered
+        hidden = seen.triangle[lips[inside, 1], lips[inside, 0]] >= self._own
+        return self._exposed(picture, frame), float(hidden.mean()) if inside.any() else 1.0
 
     def _lit(self, posed: F32, frame: int) -> U8:
         """[V, 3] u8: light that leaves each vertex; colours are square roots of light, as in tracker.raster."""
@@ -199,14 +203,24 @@ def _prop_paint(prop: props.Prop, scene: Scene) -> F64:
 
 def _painted(person: HeadModel, scene: Scene) -> F64:
     """[D, 3] the person's albedo: skin, hair, stubble."""
-    albedo = painted(person).astype(np.float64)
+    albedo = person.albedo.astype(np.float64)
     skin_parts = np.ones(len(albedo), bool)
-    skin_parts[np.concatenate([person.regions["eyes"], mouths.within(person)])] = False
+    skin_parts[np.concatenate([person.regions["eyes"], mouth.within(person)])] = False
     albedo[skin_parts] *= scene.skin
-    mouths.paint(albedo, person, scene.skin, scene.seed)
+    _paint_lips(albedo, person, scene)
+    mouth.paint(albedo, person)
     albedo[person.regions["scalp"]] = 255 * np.array(scene.hair)
     beard = np.setdiff1d(person.regions["face"], person.regions["lips"])
     nose = person.template[person.regions["lips"], 1].max() + 0.006
     grown = 1 / (1 + np.exp((person.template[beard, 1] - nose) / 0.003))
     albedo[beard] *= 1 - scene.stubble * grown[:, None]
     return np.clip(albedo, 0, 255)
+
+
+def _paint_lips(albedo: F64, person: HeadModel, scene: Scene) -> None:
+    """Thinner and paler than the head's own, in place."""
+    random = np.random.default_rng((scene.seed, 22))
+    lips = np.setdiff1d(person.regions["lips"], person.behind_lips())
+    tone = np.median(albedo[np.setdiff1d(person.regions["face"], person.regions["lips"])], axis=0)
+    red = tone + random.uniform(*PALENESS) * (LIP * scene.skin - tone)
+    albedo[lips] = tone + mouth.vermilion(person, lips)[:, None] * (red - tone)

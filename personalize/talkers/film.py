@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import cv2
@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from personalize.render import mouth
 from personalize.sound import read_audio
 from personalize.talkers.motion import TalkerMotion, talker_motion
-from personalize.talkers.skin import backdrop, painted, seen_faces, skin_block, texture
+from personalize.talkers.skin import backdrop, skin_block, texture
 from personalize.talkers.style import Style
 from personalize.talkers.visemes import load_phones
 from personalize.video_writer import VideoWriter
@@ -95,13 +96,15 @@ def render_talker(
     """
     principal = np.array([(side - 1) / 2 for side in size], np.float32)
     weights = motion.expression_for(head.expression_names)
-    neutral = head.vertices(identity, np.zeros(len(head.expression_names), np.float32))
-    studio = _Studio(head, neutral, size, focal, seed)
+    rest = np.zeros(len(head.expression_names), np.float32)
+    # What is filmed; its face is the head's.
+    person = mouth.furnished(head)
+    studio = _Studio(replace(person, template=person.vertices(identity, rest)), size, focal, seed)
     turns = Rotation.from_rotvec(motion.rotation)
     gaps = np.empty(len(weights), np.float32)
     with VideoWriter(path, motion.fps, size, audio=audio, crf=CRF) as writer:
         for frame, weight in enumerate(weights):
-            vertices = head.vertices(identity, weight, eyes=motion.eyes[frame])
+            vertices = person.vertices(identity, weight, eyes=motion.eyes[frame])
             gaps[frame] = head.lip_gap_mm(vertices)
             posed = turns[frame].apply(vertices) + motion.translation[frame]
             writer.write(studio.shoot(posed.astype(np.float32)))
@@ -109,7 +112,7 @@ def render_talker(
                 progress(frame + 1, len(weights))
     truth = Truth(
         time=np.arange(len(weights)) / motion.fps,
-        neutral=neutral,
+        neutral=head.vertices(identity, rest),
         faces=head.faces,
         identity=np.asarray(identity, np.float32),
         expression=weights,
@@ -150,9 +153,11 @@ def render_demo(
 class _Studio:
     """Skin, light, background, lens and sensor of one film."""
 
-    def __init__(self, head: HeadModel, neutral: F32, size: tuple[int, int], focal: float, seed: int) -> None:
+    def __init__(self, person: HeadModel, size: tuple[int, int], focal: float, seed: int) -> None:
         self._random = np.random.default_rng((seed, 5))
-        self._faces, self._albedo, self._places = seen_faces(head), painted(head), neutral
+        self._faces, self._places, self._lips = person.faces, person.template, person.regions["lips"]
+        self._albedo = mouth.painted(person)
+        self._detail = mouth.MouthDetail.of(person, len(person.template), seed)
         self._block = skin_block(seed)
         self._size = size
         self._large = (size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
@@ -174,6 +179,8 @@ class _Studio:
         raster = rasterize(pixels, self._faces, (right - left, bottom - top))
         around[:] = shade(raster, self._faces, vertices, self._albedo, around, LIGHT, AMBIENT)
         texture(around, raster, self._faces, self._places, self._block)
+        pixels_per_m = self._focal / float(vertices[self._lips, 2].mean())
+        self._detail.lay(around, raster, self._faces, pixels[self._lips, :2], pixels_per_m)
         picture = cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA)
         blurred = cv2.GaussianBlur(picture, (0, 0), BLUR_PX).astype(np.float32)
         shift = self._random.integers(0, self._size[0])

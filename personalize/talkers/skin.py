@@ -8,7 +8,6 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from tracker.head import HeadModel
 from tracker.raster import Raster
 
 F32 = NDArray[np.float32]
@@ -20,8 +19,6 @@ MOTTLE = ((1.2, 0.030), (3.0, 0.040), (9.0, 0.040))  # (size in voxels, contrast
 FRECKLES = 900  # in the whole block
 FRECKLE_SIZE = 1.6  # voxels
 FRECKLE_DEPTH = 0.22
-# Little light gets into a mouth: share of its reflectance that shows.
-MOUTH_LIGHT, TEETH_LIGHT = 0.04, 0.2
 
 
 def skin_block(seed: int) -> F32:
@@ -36,22 +33,6 @@ def skin_block(seed: int) -> F32:
     spots[tuple(place.T)] = random.uniform(0.3, 1.0, FRECKLES)
     spots = gaussian_filter(spots, FRECKLE_SIZE, mode="wrap")
     return np.clip(block - FRECKLE_DEPTH * np.minimum(spots / (0.6 * spots.max()), 1), 0.5, 1.4)
-
-
-def painted(head: HeadModel) -> U8:
-    """The head's albedo [D, 3] u8 with the inside of the mouth in the dark."""
-    albedo = head.albedo.astype(np.float32)
-    mouth, behind = head.regions["mouth"], head.behind_lips()
-    # Painted as lips it would hide a fifth of an opening.
-    albedo[behind] = np.median(albedo[mouth], axis=0)
-    for part, light in ((np.union1d(mouth, behind), MOUTH_LIGHT), (head.regions["teeth"], TEETH_LIGHT)):
-        albedo[part] *= np.sqrt(light)  # colours are square roots of light, as in tracker.raster
-    return albedo.astype(np.uint8)
-
-
-def seen_faces(head: HeadModel) -> NDArray[np.int32]:
-    """[F', 3] i32: all triangles but the tongue's, which stands still and hides the teeth."""
-    return head.faces[~np.isin(head.faces, head.regions["tongue"]).any(axis=1)]
 
 
 def backdrop(size: tuple[int, int], seed: int) -> U8:

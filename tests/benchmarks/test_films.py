@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.films import film, shoot
+from benchmarks.films import _Studio, film, shoot
 from benchmarks.ground_truth import GroundTruth
-from benchmarks.rendered_heads import Scene
+from benchmarks.rendered_heads import SCENES, Scene, scene_motion, stranger
 from personalize.pictures import read_frames
+from personalize.render.mouth import furnished
+from tests.personalize.mouth_view import assert_seen_between_parted_lips_only
 from tracker.head import HeadModel, load_head
 from tracker.landmarker import track_landmarks
 from tracker.raster import project
@@ -50,6 +52,21 @@ def test_hand_covers_the_mouth_for_half_a_second(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("benchmarks.props.HAND_S", (0.04, 0.04, 0.08))
     truth = shoot(replace(SCENE, hand=True, seconds=0.32), load_head(), tmp_path / "hand.mp4")
     np.testing.assert_array_equal(truth.covered > 0.5, [False, False, True, True, True, False, False, False])
+
+
+@pytest.mark.parametrize("shift", [(0.4, 0, 0), (0, 0.12, 0)], ids=["head", "mouth"])
+def test_lips_outside_the_picture_count_as_covered(shift: tuple[float, float, float]) -> None:
+    person, moves = furnished(stranger(load_head(), SCENE)), scene_motion(SCENE)
+    away = replace(moves, translation=moves.translation + np.float32(shift))
+    picture, covered = _Studio(SCENE, person, away).picture(0, person.template)
+    assert covered == 1 and picture.shape == (640, 640, 3)
+
+
+@pytest.mark.parametrize("scene", [s for s in SCENES if s.speaks], ids=lambda scene: scene.name)
+def test_teeth_are_seen_between_parted_lips_only(scene: Scene) -> None:
+    person = furnished(stranger(load_head(), scene))
+    weights = scene_motion(scene).expression_for(person.expression_names)
+    assert_seen_between_parted_lips_only(person, person.vertices(np.zeros(1), weights))
 
 
 def test_a_film_is_made_once(shot: tuple[Path, GroundTruth], monkeypatch: pytest.MonkeyPatch) -> None:

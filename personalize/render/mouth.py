@@ -1,4 +1,4 @@
-"""What makes a rendered mouth look like one: teeth and tongue in their places, vermilion, and the shade between lips.
+"""What makes a rendered mouth look like one: teeth and tongue in their places, their colours, the shade between lips.
 
 Only what the camera sees changes; lips and face stay where they are. Looks were judged beside real mouths at the same
 openings: shut lips meet in a dark line, an open mouth shows the upper teeth below the lip's edge and darkens backwards.
@@ -16,6 +16,8 @@ from tracker.head import HeadModel
 from tracker.raster import Raster, interpolate
 from tracker.track import F32, F64
 
+U8 = NDArray[np.uint8]
+
 # Metres up and forward: the head's teeth stand 12 mm behind the line where the lips meet, and reach no lower.
 UPPER_TEETH_M, LOWER_TEETH_M, TONGUE_M = (-0.0026, 0.006), (-0.003, 0.0045), (-0.004, 0.004)
 TEETH, GUM, TONGUE, MUCOSA = (
@@ -31,12 +33,12 @@ LOWER_WIDTHS_M = (0.0054, 0.006, 0.0068, 0.007, 0.007)
 BETWEEN_TEETH_M, BETWEEN_TEETH = 0.0004, 0.45
 UPPER_LIP_M, LOWER_LIP_M, BORDER_M = 0.006, 0.008, 0.0035  # height of the vermilion and of its fading border
 HALF_WIDTH_M = 0.027
-LIP = np.array([176.0, 92.0, 88.0])
-PALENESS = (0.5, 0.85)  # how far lips are from skin to the head's own red
 CREASE_M, CREASES = 0.0008, 0.03
 # Light that is lost behind what surrounds a point, by the size of the surroundings.
 CREVICES_M, CREVICE_LOSS, DEEPEST = (0.001, 0.0025, 0.006), 0.9, 2.5
 AROUND_M = 0.015
+LIP_COLOUR = 0.75  # share of the head's own, which is a lipstick's
+LIGHT_REACH_M = 0.01  # into the mouth, to 1 / e
 
 
 def furnished(person: HeadModel) -> HeadModel:
@@ -50,10 +52,16 @@ def furnished(person: HeadModel) -> HeadModel:
         template[row[roots], 1] -= np.float32(side * ROOTS_M)
         template[row, 0] *= np.float32(NARROWER)
     template[person.regions["tongue"]] += np.array([0, *TONGUE_M], np.float32)
-    basis = person.expression_basis.copy()
-    # So does the tongue when the mouth opens wide.
-    basis[:, person.regions["tongue"]] = basis[:, lower].mean(1, keepdims=True)
+    basis = on_the_jaw(person.expression_basis, person)
     return replace(person, template=template, expression_basis=basis)
+
+
+def on_the_jaw(displacement: F32, person: HeadModel) -> F32:
+    """Displacements [.., D, 3] m whose tongue moves as the lower teeth do: the head's own leaves the mouth."""
+    moved = displacement.copy()
+    lower = teeth(person)[1]
+    moved[..., person.regions["tongue"], :] = displacement[..., lower, :].mean(-2, keepdims=True)
+    return moved
 
 
 def teeth(person: HeadModel) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -72,13 +80,23 @@ def within(person: HeadModel) -> NDArray[np.int32]:
     )
 
 
-def paint(albedo: F64, person: HeadModel, skin: tuple[float, float, float], seed: int) -> None:
-    """Colour lips and mouth of an albedo [D, 3] whose skin is done, in place."""
-    random = np.random.default_rng((seed, 22))
-    lips = np.setdiff1d(person.regions["lips"], person.behind_lips())
-    tone = np.median(albedo[np.setdiff1d(person.regions["face"], person.regions["lips"])], axis=0)
-    red = tone + random.uniform(*PALENESS) * (LIP * skin - tone)
-    albedo[lips] = tone + vermilion(person, lips)[:, None] * (red - tone)
+def painted(person: HeadModel) -> U8:
+    """[D, 3] RGB: the head's own paint with paler lips, and a mouth that is darker the deeper."""
+    albedo = person.albedo.astype(np.float64)
+    face = person.regions["face"]
+    tone, redness = np.median(albedo[face], axis=0), albedo[face, 0] - albedo[face, 1]
+    red = face[redness > tone[0] - tone[1]]
+    albedo[red] = tone + LIP_COLOUR * (albedo[red] - tone)
+    paint(albedo, person)
+    inside = within(person)
+    depth = person.template[person.regions["teeth"], 2].max() - person.template[inside, 2]
+    # Colours are square roots of light, as in tracker.raster.
+    albedo[inside] *= np.exp(-0.5 * np.maximum(depth, 0) / LIGHT_REACH_M)[:, None]
+    return albedo.astype(np.uint8)
+
+
+def paint(albedo: F64, person: HeadModel) -> None:
+    """Colour what lies within the mouth, in an albedo [D, 3], in place."""
     albedo[np.union1d(person.regions["mouth"], person.behind_lips())] = MUCOSA
     albedo[person.regions["tongue"]] = TONGUE
     for row, side in zip(teeth(person), (1, -1)):
@@ -122,21 +140,29 @@ class MouthDetail:
         return cls(fields, np.random.default_rng((seed, 23)).standard_normal(97))
 
     def lay(
-        self, picture: NDArray[np.uint8], seen: Raster, faces: NDArray[np.int32], pixels_per_m: float
+        self, picture: U8, seen: Raster, faces: NDArray[np.int32], lips_px: F64, pixels_per_m: float
     ) -> None:
-        """Darken a picture [H, W, 3] of the mouth along the lines and in the crevices, in place."""
+        """Darken a picture [H, W, 3] of the mouth along the lines and in the crevices, in place.
+
+        lips_px: [L, 2], where the lips' vertices are in it; they may be outside.
+        """
+        part = _window(lips_px, picture.shape[:2], pixels_per_m)
+        around, depth = picture[part], seen.depth[part]
+        if not around.size:
+            return
+        seen = Raster(seen.triangle[part], seen.barycentric[part], depth)
         upper, lower, lips, along, narrow, wide = np.moveaxis(interpolate(seen, faces, self.fields), -1, 0)
         factor = np.ones_like(along)
         for weight, widths in ((upper, UPPER_WIDTHS_M), (lower, LOWER_WIDTHS_M)):
-            edges = np.concatenate([[0.0], np.cumsum(widths)])
-            nearest = np.abs(np.abs(along)[..., None] - edges).min(axis=-1)
-            factor -= BETWEEN_TEETH * (weight > 0.9) * np.exp(-((nearest / BETWEEN_TEETH_M) ** 2))
+            row, edges = weight > 0.9, np.concatenate([[0.0], np.cumsum(widths)])
+            nearest = np.abs(np.abs(along[row])[:, None] - edges).min(axis=-1)
+            factor[row] -= BETWEEN_TEETH * np.exp(-((nearest / BETWEEN_TEETH_M) ** 2))
         place = np.arange(len(self.creases)) - len(self.creases) // 2
         factor += CREASES * lips * np.interp(along / CREASE_M, place, self.creases)
         # Lips, thin and lit through, meet in a thin line.
         for size, weight in zip(CREVICES_M, (narrow, wide, wide)):
-            factor *= np.exp(-0.5 * CREVICE_LOSS * weight * crevices(seen.depth, size, pixels_per_m))
-        picture[:] = np.clip(picture * factor[..., None] + 0.5, 0, 255)
+            factor *= np.exp(-0.5 * CREVICE_LOSS * weight * crevices(depth, size, pixels_per_m))
+        around[:] = np.clip(around * factor[..., None] + 0.5, 0, 255)
 
 
 def _along(row: F32) -> F32:
@@ -157,8 +183,9 @@ def crevices(depth: F32, size: float, pixels_per_m: float) -> F32:
     return np.where(seen, np.clip(behind / np.float32(size), 0, DEEPEST), 0)
 
 
-def window(lips: F64, size: tuple[int, int], pixels_per_m: float) -> tuple[slice, slice]:
-    """Rows and columns of a picture (width, height) that hold lips [L, 2] px and what is near."""
-    low = np.clip(lips.min(0) - AROUND_M * pixels_per_m, 0, size).astype(int)
-    high = np.clip(lips.max(0) + AROUND_M * pixels_per_m, 0, size).astype(int)
+def _window(lips: F64, shape: tuple[int, int], pixels_per_m: float) -> tuple[slice, slice]:
+    """Rows and columns of a picture [H, W] that hold lips [L, 2] px and what is near; empty where it holds none."""
+    near = AROUND_M * pixels_per_m
+    low = np.clip(lips.min(0) - near, 0, shape[::-1]).astype(int)
+    high = np.clip(lips.max(0) + near, 0, shape[::-1]).astype(int)
     return slice(low[1], high[1]), slice(low[0], high[0])
