@@ -18,6 +18,7 @@ from model.checkpoint import Checkpoint
 from model.dataset import Sequence
 from model.metrics import EYELIDS, eyelid_opening_mm
 from model.motion import FPS
+from model.objective import SMALLEST_SPREAD
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -40,10 +41,9 @@ def independent_blinks(
 ) -> tuple[list[Sequence], F32 | None]:
     """The sequences without their blinks, and blinks at random moments, [S, N, K] m for the checkpoint's S styles.
 
-    Where the mesh names no eyelids, or nobody blinks, the sequences as they are and None; so for a base model: it sees
-    too many blinks to learn them by heart.
+    Where the mesh names no eyelids, or nobody blinks, the sequences as they are and None.
     """
-    if checkpoint.kind == "base" or not all(name in checkpoint.regions for pair in EYELIDS for name in pair):
+    if not all(name in checkpoint.regions for pair in EYELIDS for name in pair):
         return list(sequences), None
     around = _around_eyes(checkpoint)
     opened = [_opened(checkpoint, sequence, around) for sequence in sequences]
@@ -106,9 +106,13 @@ def _opened(checkpoint: Checkpoint, sequence: Sequence, around: F64) -> tuple[Se
 
 
 def _around_eyes(checkpoint: Checkpoint) -> F64:
-    """[K, K]: keeps of coefficients what they move around the eyes, B diag(m) B' with m from 1 at the lids to 0."""
+    """[K, K]: keeps of coefficients what they move around the eyes, B diag(m) B' with m from 1 at the lids to 0.
+
+    Into coefficients that the person hardly ever moves nothing goes: there any bit would outweigh all else in the loss.
+    """
     lids = np.concatenate([checkpoint.regions[name] for pair in EYELIDS for name in pair])
     distance, _ = cKDTree(checkpoint.template[lids]).query(checkpoint.template)
     share = np.clip((FAR_M - distance) / (FAR_M - NEAR_M), 0, 1)
     flat = checkpoint.basis.reshape(len(checkpoint.basis), -1).astype(np.float64)
-    return (flat * np.repeat(share, 3)) @ flat.T
+    moving = checkpoint.standardization.spread >= SMALLEST_SPREAD
+    return (flat * np.repeat(share, 3)) @ flat.T * moving

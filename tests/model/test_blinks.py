@@ -33,8 +33,7 @@ def eyes() -> tuple[Checkpoint, np.ndarray]:
     template[lids] = [[0.03, y, 0] for y in (OPEN_MM / 1000, 0, OPEN_MM / 1000, 0)]
     rims = {name: np.array([6 + i]) for i, name in enumerate(name for pair in EYELIDS for name in pair)}
     made = talker.checkpoint([talker.sequence(60, 0)], styles=2)
-    regions = made.regions | rims
-    checkpoint = replace(made, kind="subject", basis=basis, template=template, regions=regions)
+    checkpoint = replace(made, basis=basis, template=template, regions=made.regions | rims)
     return checkpoint, np.eye(talker.K, dtype=np.float32)[0] * 0.001 * np.sqrt(2)
 
 
@@ -125,12 +124,5 @@ def test_nothing_to_be_found() -> None:
     assert independent_blinks(checkpoint, [still], 0)[1] is None
     lidless = replace(checkpoint, regions=talker.REGIONS)
     (same,), drawn = independent_blinks(lidless, [blinking()], 0)
-    assert drawn is None
-    np.testing.assert_array_equal(same.coefficients, blinking().coefficients)
-
-
-def test_a_base_models_people_blink_where_they_do() -> None:
-    checkpoint, _ = eyes()
-    (same,), drawn = independent_blinks(replace(checkpoint, kind="base"), [blinking()], 0)
     assert drawn is None
     np.testing.assert_array_equal(same.coefficients, blinking().coefficients)
