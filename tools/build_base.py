@@ -35,7 +35,7 @@ SENTENCES = Path(__file__).parent / "base_sentences.txt"
 TALKERS = 16
 SENTENCES_EACH = 28
 TRAINING = TrainingConfig(
-    iterations=40_000, candidates=1, feature_dropout=0.0, weight_decay=0.0, precision="float32"
+    iterations=24_000, candidates=1, feature_dropout=0.0, weight_decay=0.0, precision="float32"
 )
 TAKES = 3  # the same sound, moved to differently and recorded differently
 REGIONS = (
