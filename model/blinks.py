@@ -19,6 +19,7 @@ from model.dataset import Sequence
 from model.metrics import EYELIDS, eyelid_opening_mm
 from model.motion import FPS
 from model.objective import SMALLEST_SPREAD
+from model.vertex_mask import masked
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -113,6 +114,4 @@ def _around_eyes(checkpoint: Checkpoint) -> F64:
     lids = np.concatenate([checkpoint.regions[name] for pair in EYELIDS for name in pair])
     distance, _ = cKDTree(checkpoint.template[lids]).query(checkpoint.template)
     share = np.clip((FAR_M - distance) / (FAR_M - NEAR_M), 0, 1)
-    flat = checkpoint.basis.reshape(len(checkpoint.basis), -1).astype(np.float64)
-    moving = checkpoint.standardization.spread >= SMALLEST_SPREAD
-    return (flat * np.repeat(share, 3)) @ flat.T * moving
+    return masked(checkpoint.basis, share) * (checkpoint.standardization.spread >= SMALLEST_SPREAD)

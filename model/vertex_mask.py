@@ -28,6 +28,14 @@ from model.motion import Motion
 F64 = NDArray[np.float64]
 
 
+def masked(basis: NDArray[np.floating], share: NDArray[np.floating]) -> F64:
+    """[K, K] B diag(m) B': what coefficients of an orthonormal basis [K, D, 3] become where vertices move by the share
+    m [D] of it.
+    """
+    flat = basis.reshape(len(basis), -1).astype(np.float64)
+    return (flat * np.repeat(share.astype(np.float64), 3)) @ flat.T
+
+
 @dataclass(frozen=True)
 class VertexMask:
     """frames [N] bool: where it holds. free [K, K] = B diag(1 - m) B'. kept [N, K] = (m known) B', m."""
@@ -49,7 +57,7 @@ class VertexMask:
         m = np.repeat(share.astype(np.float64), 3)
         theirs = known.basis.reshape(len(known.basis), -1).astype(np.float64)
         coefficients = np.where(frames[:, None], known.coefficients, 0).astype(np.float64)
-        return cls(frames, (flat * (1 - m)) @ flat.T, coefficients @ (theirs * m @ flat.T))
+        return cls(frames, masked(basis, 1 - share), coefficients @ (theirs * m @ flat.T))
 
     def overwrite(self, standardization: Standardization) -> Overwrite:
         """For standardized x0hat [>= N, *b, K] with c = mean + scale x0hat; frames past N stay as they are."""

@@ -126,3 +126,12 @@ def test_nothing_to_be_found() -> None:
     (same,), drawn = independent_blinks(lidless, [blinking()], 0)
     assert drawn is None
     np.testing.assert_array_equal(same.coefficients, blinking().coefficients)
+
+
+def test_nothing_goes_into_what_hardly_moves() -> None:
+    checkpoint, _ = eyes()
+    spread = np.ones(talker.K, np.float32)
+    spread[0] = 0.1
+    hardly = replace(checkpoint, standardization=replace(checkpoint.standardization, spread=spread))
+    _, drawn = independent_blinks(hardly, [blinking()], 0)
+    assert drawn is None or not drawn[..., 0].any()
