@@ -48,6 +48,8 @@ class Weights:
     """Standard deviation of one landmark, embedding bias included."""
     pair_noise_mm: float = 0.4
     """Standard deviation of an opening between paired lip or lid landmarks, which err together."""
+    pair_noise_share: float = 0.0
+    """What this grows by with the opening itself: shut skin touches, but where open lips end is a matter of opinion."""
     robust: float = 6.0
     """Cauchy scale, in standard deviations: residuals beyond it count ever less."""
     evidence: float = 0.2
@@ -271,10 +273,17 @@ class Energy:
     def _residuals(self, camera: F64) -> tuple[F64, F64]:
         """Residuals [n, L+Q, 2] of landmarks, then pairs, in standard deviations; their scales [n, L+Q]."""
         error = self._with_pairs(self._pixels(camera) - self.observed)
-        counts = (len(self.model.mean), len(self.model.pairs))
-        sd_mm = np.repeat((self.weights.noise_mm, self.weights.pair_noise_mm), counts)
+        points_mm = np.full(self.observed.shape[:2], self.weights.noise_mm)
+        sd_mm = np.concatenate([points_mm, self._pair_noise_mm()], axis=1)
         scale = 1e3 / (sd_mm * self.px_per_m[:, None])
         return error * scale[..., None], scale
+
+    def _pair_noise_mm(self) -> F64:
+        """[n, Q] standard deviation of the openings observed."""
+        upper, lower = self.model.pairs.T
+        apart = np.linalg.norm(self.observed[:, upper] - self.observed[:, lower], axis=-1)
+        opening_mm = 1e3 * np.maximum(apart / self.px_per_m[:, None] - self.model.touch, 0)
+        return self.weights.pair_noise_mm + self.weights.pair_noise_share * opening_mm
 
     def _robust(self, residual: F64) -> tuple[F64, F64]:
         """Half the Cauchy loss and its weight, both [n, L+Q]."""

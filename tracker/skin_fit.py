@@ -38,12 +38,14 @@ class Photometry:
     """Cauchy scale, in standard deviations of a point's grey level."""
     prior: float = 2.0
     """Factor on the landmark fit's expression prior: more evidence needs more holding of what it cannot tell."""
-    pair_noise_mm: float = 0.2
+    pair_noise_mm: float = 0.07
     """Standard deviation of an opening between landmarks that the colours moved: real lips roll, wet and fold as no
     albedo tells.
 
-    At 1 the skin opened lips by 1 to 3 mm on real clips that the eye sees shut.
+    At 1 the skin opened lips by 1 to 3 mm on real clips that the eye sees shut, at .2 some by 1.5.
     """
+    pair_noise_share: float = 0.05
+    """What this grows by with the opening."""
     edge_blurs: float = 1.0
     """Skin nearer to the mouth's inside than so many standard deviations of a blur shows teeth and dark as well."""
     smoothness: float = 20.0
@@ -86,7 +88,11 @@ class Subject:
     def of(cls, head: HeadModel, identity: F32, energy: Energy, photometry: Photometry) -> Subject:
         """The subject with sample points on the skin and windows around the landmarks."""
         window = Window.around(energy.observed, energy.px_per_m, photometry.finest_px_per_m)
-        weights = replace(energy.weights, pair_noise_mm=photometry.pair_noise_mm)
+        weights = replace(
+            energy.weights,
+            pair_noise_mm=photometry.pair_noise_mm,
+            pair_noise_share=photometry.pair_noise_share,
+        )
         energy = replace(energy, weights=weights, strictness=energy.strictness * photometry.prior)
         return cls(head, identity, energy, skin_of(head, energy.model, identity), window, photometry)
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -64,8 +66,10 @@ def random_energy(frames: int, seed: int = 1) -> tuple[Energy, np.ndarray]:
     return energy, x
 
 
-def test_gradient_of_identity_and_frames_matches_finite_differences():
+@pytest.mark.parametrize("share", (0.0, 0.3))
+def test_gradient_of_identity_and_frames_matches_finite_differences(share: float):
     energy, x = random_energy(3)
+    energy = replace(energy, weights=Weights(pair_noise_share=share))
     identity = np.array([0.5, -0.2, 0.1, 0.8])
     analytic = energy.linearize(energy.shape(identity), x, with_identity=True)
     both = np.concatenate([np.tile(identity, (3, 1)), x], axis=1)
@@ -79,6 +83,25 @@ def test_gradient_of_identity_and_frames_matches_finite_differences():
         step[column] = 1e-6
         numeric = (value(both + step) - value(both - step)) / 2e-6
         np.testing.assert_allclose(analytic.gradient[:, column], numeric, rtol=1e-4, atol=1e-3)
+
+
+def test_an_error_of_an_open_pair_weighs_less_than_one_of_a_shut_pair():
+    energy, x = random_energy(1)
+    weights = Weights(pair_noise_mm=0.1, pair_noise_share=0.1, robust=1e3)
+    cost = []
+    for open_m in (0.0, 0.01):
+        shape = energy.model.mean.copy()
+        touch = energy.model.heights(shape) - open_m
+        told = replace(
+            energy,
+            weights=weights,
+            model=replace(energy.model, touch=touch, expression=0 * energy.model.expression),
+        )
+        told.observed[:] = told.project(shape, x)
+        exact = told.value(shape, x)
+        shape[0, 1] += 0.001
+        cost.append(float((told.value(shape, x) - exact)[0]))
+    assert cost[1] < 0.5 * cost[0]
 
 
 def test_hessian_is_symmetric_and_convex():
