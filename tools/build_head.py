@@ -44,7 +44,8 @@ def build(source: Source) -> dict[str, NDArray[np.generic]]:
     mean, modes, share = identity_modes(people, mesh, _variance_weights(source, mesh, rest), MODES)
     mean -= mean[-3]  # the origin is the jaw hinge, between the ears
     joined = seams(source, mesh, mean[:-3])
-    template, basis = joined["lips"].close(mean[:-3]), joined["lips"].close(modes[:, :-3])
+    template = joined["lips"].part_behind(joined["lips"].close(mean[:-3]))
+    basis = joined["lips"].close(modes[:, :-3])
     names, shapes = expressions(source, mesh, template, joined)
     regions = make_regions(source, mesh, template, joined)
     print(

@@ -154,7 +154,8 @@ class Seam:
     """Two edges that meet, each from its right to its left corner.
 
     upper, lower: all vertices of the edges. upper_paired, lower_paired: as many as the coarser edge has, paired.
-    closing: [D, D], brings the edges together half way each and takes the rings around along.
+    closing: [D, D], brings the edges together half way each and takes the rings around along. behind_upper,
+    behind_lower: vertices of the rings behind the edges.
     """
 
     upper: I64
@@ -162,6 +163,22 @@ class Seam:
     upper_paired: I64
     lower_paired: I64
     closing: csr_array
+    behind_upper: I64
+    behind_lower: I64
+
+    def part_behind(self, vertices: F64) -> F64:
+        """Positions [D, 3] of which nothing behind an edge reaches beyond it.
+
+        The source's lips bulge behind the line where they meet: they would hide an opening of up to 1.3 mm.
+        """
+        parted = vertices.copy()
+        for behind, edge, outer, beside in (
+            (self.behind_upper, self.upper, np.maximum, -np.inf),
+            (self.behind_lower, self.lower, np.minimum, np.inf),
+        ):
+            (x, y), at = vertices[edge, :2].T, vertices[behind]
+            parted[behind, 1] = outer(at[:, 1], np.interp(at[:, 0], x, y, left=beside, right=beside))
+        return parted
 
     def close(self, vertices: F64) -> F64:
         """[.., D, 3] with the seam closed. Linear: it may be given positions or differences of them."""
@@ -187,7 +204,8 @@ def seam(mesh: Mesh, upper: Rows, lower: Rows, follow: dict[int, float], rest: F
     edges = halves[0][0], halves[1][0]
     fewer = min(edges, key=len)
     upper_paired, lower_paired = (edge[np.abs(rest[edge, 0] - rest[fewer, :1]).argmin(1)] for edge in edges)
-    return Seam(edges[0], edges[1], upper_paired, lower_paired, closing)
+    behind = (np.concatenate([half[number] for number in half if number < 0]) for half in halves)
+    return Seam(edges[0], edges[1], upper_paired, lower_paired, closing, *behind)
 
 
 def _opposite(vertex: int, edge: I64, rest: F64) -> tuple[I64, F64]:

@@ -19,10 +19,10 @@ REST_SHARE = 0.5  # of the key frames: frames at rest, which tell the neutral fa
 Frames = NDArray[np.int64]
 
 
-def key_frames(observed: F64, px_per_m: F64) -> tuple[Frames, Frames]:
+def key_frames(observed: F64, px_per_m: F64, count: int = KEY_FRAMES) -> tuple[Frames, Frames]:
     """Frames at rest (mouth closed, little motion) spread over poses, and others, over poses and expressions.
 
-    KEY_FRAMES at most, REST_SHARE of them at rest. observed: [n, 478, 2] px.
+    `count` at most, REST_SHARE of them at rest. observed: [n, 478, 2] px.
     """
     n = len(observed)
     opening = np.linalg.norm(observed[:, 13] - observed[:, 14], axis=-1) / px_per_m
@@ -31,7 +31,7 @@ def key_frames(observed: F64, px_per_m: F64) -> tuple[Frames, Frames]:
     speed[1:] = np.linalg.norm(np.diff(lips, axis=0), axis=-1).max(1)
     quiet = np.sort(np.argsort(opening + speed, kind="stable")[: max(1, n // 5)])
     pose, features = _looks(observed, px_per_m)
-    count = min(n, KEY_FRAMES)
+    count = min(n, count)
     usual = np.linalg.norm(pose[quiet] - np.median(pose[quiet], axis=0), axis=1).argmin()
     rest = farthest(pose, quiet[[usual]], quiet, max(1, int(count * REST_SHARE)))
     return np.sort(rest), np.sort(farthest(features, rest, np.arange(n), count)[len(rest) :])

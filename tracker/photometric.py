@@ -51,7 +51,7 @@ class PhotometricEnergy:
 
     def value(self, shape: F64, x: F64) -> F64:
         """[n] the energy at x [n, U] of the subject with landmarks `shape` [L, 3] at rest."""
-        skin = self._robust(self.grey(x) - self.expected)[0]
+        skin = self.loss(self.grey(x) - self.expected)[0]
         return self.landmarks.value(shape, x) + skin - x @ self.pull
 
     def linearize(self, shape: F64, x: F64) -> Quadratic:
@@ -65,10 +65,10 @@ class PhotometricEnergy:
 
     def linearize_skin(self, x: F64) -> Quadratic:
         """The part of the grey levels alone, nothing taken off."""
-        turned, camera = self._points(x)
-        grey, push = self._read(camera)
+        turned, camera = self.points(x)
+        grey, push = self.read(camera)
         residual = grey - self.expected
-        value, weight = self._robust(residual)
+        value, weight = self.loss(residual)
         rotation, swing = rotation_matrix(x[:, -6:-3]), left_jacobian(x[:, -6:-3])
         square = np.zeros((len(x), x.shape[1] + 1, x.shape[1] + 1), np.float32)
         add_squares(
@@ -80,9 +80,9 @@ class PhotometricEnergy:
 
     def grey(self, x: F64) -> F32:
         """[n, P] grey levels of the pictures where the points lie at x [n, U]."""
-        return self._read(self._points(x)[1])[0]
+        return self.read(self.points(x)[1])[0]
 
-    def _points(self, x: F64) -> tuple[F32, F32]:
+    def points(self, x: F64) -> tuple[F32, F32]:
         """[n, P, 3] m: turned about the landmarks' centre, and in the camera frame."""
         expression = self.skin.expression
         moved = x[:, :-POSE].astype(np.float32) @ expression.reshape(-1, expression.shape[2]).T
@@ -90,10 +90,11 @@ class PhotometricEnergy:
         turned = face @ rotation_matrix(x[:, -6:-3]).transpose(0, 2, 1).astype(np.float32)
         return turned, turned + x[:, None, -3:].astype(np.float32)
 
-    def _read(self, camera: F32) -> tuple[F32, F32]:
+    def read(self, camera: F32) -> tuple[F32, F32]:
+        """Grey levels [n, P] at points [n, P, 3] m of the camera frame, and their slopes [n, P, 3] per m."""
         return self.view.read(camera, self.landmarks.focal, self.landmarks.principal)
 
-    def _robust(self, residual: F32) -> tuple[F64, F32]:
+    def loss(self, residual: F32) -> tuple[F64, F32]:
         """Half the Cauchy loss of each frame [n], and each point's weight [n, P] per squared grey level."""
         c2 = (np.float32(self.robust) * self.noise) ** 2
         square = residual**2 / c2

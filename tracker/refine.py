@@ -1,4 +1,4 @@
-"""Refine a clip's landmark track by its pictures: openings by colours, then all by grey levels, stretch by stretch."""
+"""Refine a clip's landmark track by its pictures: openings by colours, identity and then all frames by grey levels."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracker.fit import at_rest, make_track, resume, runs, smoothness_between, trusted, with_lips_shut
+from tracker.key_frames import key_frames
 from tracker.lip_opening import LipLines, lip_widths
 from tracker.rigid_pose import hold_poses
-from tracker.skin_fit import Photometry, Subject, fit_openings, fit_stretch, learn_levels
+from tracker.skin_fit import Photometry, Subject, fit_landmarks, fit_stretch, learn_levels
+from tracker.skin_identity import fit_identity_to_skin
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
 from tracker.view import U8, Index
 
 if TYPE_CHECKING:
     from tracker.head import HeadModel
 
-KEYS = 12, 48  # frames, spread over the clip, that tell the albedo: so many at least and at most,
-KEYS_APART = 3  # and no closer than this, since neighbours say the same and each costs as much as three fits
+# Frames that tell the albedo, half as many the identity: so many at least and at most, and no more than one of
+# KEYS_APART, since each costs as much as three fits.
+KEYS, KEYS_APART = (12, 48), 3
 STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
 HALFWAY = 0.5  # to the bundle's poses: grey levels err as much, but slowly, and the tracks at random
 HELD_BYTES = 256 << 20  # of cut-out faces, about 100 s of them; a longer clip is read twice instead
@@ -51,14 +54,15 @@ def refine_track(
     photometry: Photometry | None = None,
     evidence: F32 | None = None,
 ) -> Refined:
-    """Expression, pose and gaze of the valid frames again, with the pictures; identity and camera stay.
+    """Identity, and expression, pose and gaze of the valid frames again, with the pictures; the camera stays.
 
     segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
     each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
     look like keeps its landmark fit, and so does one whose picture is missing. bundle, evidence: see `fit_track`; poses
     end halfway between what the grey levels and the bundle tell.
     What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips
-    (tracker/lip_opening.py), pose and jitter by the grey levels of the skin.
+    (tracker/lip_opening.py), depth by how the skin shifts in a turn (tracker/skin_identity.py), pose and jitter by the
+    grey levels of the skin.
     """
     photometry = photometry or Photometry()
     energy, x, observed, good = resume(track, landmarks, camera, head, evidence)
@@ -68,8 +72,11 @@ def refine_track(
     sound = trusted(evidence, good)
     subject = Subject.of(head, track.identity, energy, photometry)
     lines = LipLines.across(observed, energy.px_per_m, x)
-    keys, cuts, colours = _looked_at(subject, lines, camera, frames, good, sound)
-    if not keys:
+    count = int(np.clip(len(sound) // KEYS_APART, *KEYS))
+    usual = sound[np.linspace(0, len(sound) - 1, count).round().astype(int)]
+    rest, other = (sound[part] for part in key_frames(observed[sound], energy.px_per_m[sound], count // 2))
+    held, cuts, colours = _looked_at(subject, lines, camera, frames, good, {*usual, *rest, *other})
+    if not held:
         return Refined(track, unknown)
     rows = np.array(list(colours))
     bare = np.flatnonzero(np.isin(rows, sound))
@@ -77,10 +84,15 @@ def refine_track(
     if widths is not None:
         observed = lines.opened(observed, rows, widths)
         subject = _with_landmarks(subject, observed, x, sound)
-        smoothness = smoothness_between(subject.energy, landmarks.time, good[rows], segment)
-        x[rows] = fit_openings(subject, rows, x[rows], smoothness)
-    rows = np.array(list(keys))
-    levels = learn_levels(subject, list(keys.values()), rows, x[rows])
+    identity = fit_identity_to_skin(subject, held, (rest, other), x)
+    if widths is not None or (identity != track.identity).any():
+        subject = subject.with_identity(identity)
+        smoothness = smoothness_between(subject.energy, landmarks.time, good, segment)
+        x = fit_landmarks(subject, x, smoothness)
+        if camera.method != "prior":
+            x = hold_poses(x, bundle, good, runs(good, segment), sound, 1.0)
+    rows = np.array([row for row in held if row in usual])
+    levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
     refined = x.copy()
     for start, part in _stretches(cuts, len(good)):
@@ -97,7 +109,6 @@ def refine_track(
             progress(min(start + STRETCH, len(good)), len(good))
     if camera.method != "prior":
         refined = hold_poses(refined, bundle, good, runs(good, segment), sound, HALFWAY)
-    identity = track.identity.astype(np.float64)
     out = make_track(landmarks, camera, head, subject.energy, observed, identity, refined, good)
     return Refined(out, _relative(deviation, good, len(track.time)))
 
@@ -118,15 +129,12 @@ def _looked_at(
     camera: Camera,
     frames: Callable[[], Iterable[Frame]],
     good: Index,
-    sound: Index,
+    keys: set[int],
 ) -> tuple[dict[int, U8], Iterable[tuple[int, U8]], dict[int, U8]]:
-    """By rows: cut-out faces of key frames among `sound`, and of all frames `good`, and these frames' colours along the
-    lines.
+    """By rows: cut-out faces of the key frames, and of all frames `good`, and these frames' colours along the lines.
 
     A short clip's pictures are read once.
     """
-    count = int(np.clip(len(sound) // KEYS_APART, *KEYS))
-    keys = set(sound[np.linspace(0, len(sound) - 1, count).round().astype(int)].tolist())
     short = len(good) * subject.window.size[0] * subject.window.size[1] <= HELD_BYTES
     held: dict[int, U8] = {}
     colours: dict[int, U8] = {}

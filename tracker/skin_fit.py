@@ -53,7 +53,7 @@ class Photometry:
     steps: int = 2
     """Gauss-Newton steps at each blur."""
     reopening: int = 3
-    """Steps of the landmark fit after the lips' openings have been read from the pictures."""
+    """Steps of the landmark fit after identity and openings have been read from the pictures."""
     steadying: int = 2
     """Rounds in which the key frames tell what would move them all alike."""
 
@@ -95,6 +95,11 @@ class Subject:
         )
         energy = replace(energy, weights=weights, strictness=energy.strictness * photometry.prior)
         return cls(head, identity, energy, skin_of(head, energy.model, identity), window, photometry)
+
+    def with_identity(self, identity: F64) -> Subject:
+        """The same with another identity [Ki]."""
+        subject = identity.astype(np.float32)
+        return replace(self, identity=subject, skin=skin_of(self.head, self.energy.model, subject))
 
     @property
     def px_per_m(self) -> float:
@@ -140,12 +145,10 @@ class Subject:
         )
 
 
-def fit_openings(subject: Subject, rows: Index, x: F64, smoothness: Smoothness) -> F64:
-    """Expressions of frames `rows` from x [n, U] on, by landmarks that have changed since; the poses stay."""
+def fit_landmarks(subject: Subject, x: F64, smoothness: Smoothness) -> F64:
+    """All frames from x [n, U] on, by landmarks alone, which have changed since, or the identity has."""
     shape = subject.energy.shape(subject.identity.astype(np.float64))
-    energy, steps = subject.energy.select(rows), subject.photometry.reopening
-    found, _ = solve_frames(energy, shape, x, smoothness, steps=steps)
-    return np.concatenate([found[:, :-POSE], x[:, -POSE:]], axis=1)
+    return solve_frames(subject.energy, shape, x, smoothness, steps=subject.photometry.reopening)[0]
 
 
 def learn_levels(subject: Subject, cuts: Sequence[U8], rows: Index, x: F64) -> list[Level]:
@@ -161,7 +164,7 @@ def learn_levels(subject: Subject, cuts: Sequence[U8], rows: Index, x: F64) -> l
         grey = energy.grey(x)
         albedo, usual = appearance(grey, basis, seen)
         expected = shaded(albedo, basis, frame_light(grey, albedo, basis, seen, usual))
-        noise = _noise(grey - expected, seen > 0, subject.skin.mouth)
+        noise = grey_noise(grey - expected, seen > 0, subject.skin.mouth)
         energy = replace(energy, expected=expected, noise=noise)
         energy = replace(energy, pull=energy.linearize_skin(x).gradient.mean(0))
         for _ in range(subject.photometry.steadying):
@@ -170,7 +173,7 @@ def learn_levels(subject: Subject, cuts: Sequence[U8], rows: Index, x: F64) -> l
     return levels
 
 
-def _noise(error: F32, seen: Bool, mouth: Bool) -> F32:
+def grey_noise(error: F32, seen: Bool, mouth: Bool) -> F32:
     """Standard deviation [P] of grey levels by the median of errors [n, P], which outliers do not reach.
 
     Rigid skin has one in common. Around the mouth [P] it stretches, folds and gets wet as no albedo tells: each point

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from tracker.energy import POSE, Energy, LandmarkModel, Quadratic
+from tracker.energy import POSE, LandmarkModel, Quadratic, Weights
 from tracker.track import F64
 
 ROUNDS = 4  # of fixing what passes a bound
@@ -101,8 +101,29 @@ class Solution:
     steps: int
 
 
+class SharedEnergy(Protocol):
+    """The energy of n key frames that `solve_subject` minimizes over their subject too."""
+
+    @property
+    def model(self) -> LandmarkModel:
+        """The head, whose modes have bounds."""
+
+    @property
+    def weights(self) -> Weights:
+        """The identity's prior among them."""
+
+    def shape(self, identity: F64) -> F64:
+        """[.., 3] m, the subject's points at rest."""
+
+    def value(self, shape: F64, x: F64) -> F64:
+        """[n] at x [n, P] of the subject `shape`."""
+
+    def linearize(self, shape: F64, x: F64, with_identity: bool) -> Quadratic:
+        """Gauss-Newton model of the unknowns [identity (Ki), x]."""
+
+
 def solve_subject(
-    energy: Energy, identity: F64, x: F64, steps: int = 20, tolerance: float = 1e-4
+    energy: SharedEnergy, identity: F64, x: F64, steps: int = 20, tolerance: float = 1e-4
 ) -> Solution:
     """Identity and the n key frames together: Levenberg-Marquardt, per-frame blocks eliminated (Schur)."""
     prior = energy.weights.identity * len(x)
@@ -113,7 +134,7 @@ def solve_subject(
 
     damping, value, done = 1e-3, total(identity, x), 0
     for _ in range(steps):
-        quadratic = energy.linearize(energy.shape(identity), x, with_identity=True)
+        quadratic = energy.linearize(energy.shape(identity), x, True)
         while True:
             solve = partial(schur_step, quadratic, identity, prior, damping)
             step_identity, step = bounded_step(bounds, x, quadratic.gradient[:, len(identity) :], solve)
@@ -247,7 +268,7 @@ def solve_frames(
     return x, value
 
 
-def _bounds(energy: FrameEnergy) -> Bounds:
+def _bounds(energy: FrameEnergy | SharedEnergy) -> Bounds:
     return Bounds(energy.model.modes.lower, energy.model.modes.upper)
 
 

@@ -127,6 +127,15 @@ def test_lips_touch_on_every_neutral_face_and_open_with_the_jaw(head: HeadModel)
     assert (np.diff(opening) > 2).all() and 25 < opening[-1] < 45
 
 
+def test_shut_lips_do_not_bulge_into_each_other_behind_the_line_where_they_meet(head: HeadModel) -> None:
+    behind = head.behind_lips()
+    follows_jaw = _weights(head, jawOpen=1) @ head.expression_basis[:, behind, 1].astype(np.float64) < -0.012
+    x, y = head.template[head.regions["lower_lip_edge"], :2].T
+    within = np.abs(head.template[behind, 0]) < 0.02  # at the corners nothing tells upper from lower
+    above = head.template[behind, 1] - np.interp(head.template[behind, 0], x, y)
+    assert above[within & ~follows_jaw].min() > -1e-4 and above[within & follows_jaw].max() < 1e-4
+
+
 @pytest.mark.parametrize("jaw", [0.15, 0.4])
 def test_between_the_lips_an_open_mouth_shows_its_inside(head: HeadModel, jaw: float) -> None:
     vertices = head.vertices(np.zeros(100), _weights(head, jawOpen=jaw))

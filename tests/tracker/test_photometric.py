@@ -12,7 +12,7 @@ from tracker.energy import POSE, Energy, Weights, landmark_model
 from tracker.flame import flame_head
 from tracker.head import load_head
 from tracker.photometric import PhotometricEnergy
-from tracker.skin_fit import LEAST_NOISE, _noise
+from tracker.skin_fit import LEAST_NOISE, grey_noise
 from tracker.view import View, Window
 
 HEAD = load_head()
@@ -167,7 +167,7 @@ def test_only_the_mouth_has_noise_of_its_own():
     error[:, 40:50] *= 4
     seen, mouth = np.ones(error.shape, bool), np.arange(90) >= 45
     seen[:, 89] = False
-    noise = _noise(error, seen, mouth)
+    noise = grey_noise(error, seen, mouth)
     assert noise[45:50] == pytest.approx(12, rel=0.25)
     assert noise[:45] == pytest.approx(noise[0]) and noise[89] == noise[0]
-    assert (_noise(error, np.zeros_like(seen), mouth) == LEAST_NOISE).all()
+    assert (grey_noise(error, np.zeros_like(seen), mouth) == LEAST_NOISE).all()

@@ -22,6 +22,7 @@ HEAD = load_head()
 NAMES = list(HEAD.expression_names)
 SIZE, FOCAL, DISTANCE, FRAMES = (320, 320), 460.0, 0.5, 24
 CAMERA = Camera(FOCAL, 0.0, (159.5, 159.5), (), SIZE, "given", "")
+MEAN = np.zeros(len(HEAD.identity_basis), np.float32)
 NO_BUNDLE = Bundle(
     np.zeros(0, np.int32), *(np.zeros((0, 3), np.float32) for _ in range(3)), np.zeros((0, 4), np.float32)
 )
@@ -71,7 +72,7 @@ def dark_mouth() -> Film:
     return filmed(freckled(inside=0.4), opening_error_mm=0.8)
 
 
-def filmed(albedo: np.ndarray, opening_error_mm: float = 0.0) -> Film:
+def filmed(albedo: np.ndarray, opening_error_mm: float = 0.0, identity: np.ndarray = MEAN) -> Film:
     rng = np.random.default_rng(0)
     t = np.arange(FRAMES) / 25
     expression = np.zeros((FRAMES, len(NAMES)), np.float32)
@@ -80,7 +81,6 @@ def filmed(albedo: np.ndarray, opening_error_mm: float = 0.0) -> Film:
     turn = Rotation.from_rotvec(np.radians([3.0, 10.0, 2.0]) * np.sin(np.outer(t, [3.0, 2.0, 4.0])))
     rotation = turn.as_matrix() @ np.diag([1.0, -1.0, -1.0])
     translation = np.array([0, 0, DISTANCE]) - rotation @ HEAD.template.mean(0)
-    identity = np.zeros(len(HEAD.identity_basis), np.float32)
     person = np.broadcast_to(identity, (FRAMES, len(identity)))
     vertices = HEAD.vertices(person, expression)
     posed = (vertices @ rotation.transpose(0, 2, 1) + translation[:, None]).astype(np.float32)
@@ -127,7 +127,6 @@ def test_resume_is_the_inverse_of_make_track(film: Film):
 def test_pictures_lower_the_error(film: Film):
     refined = film.refine()
     assert turn_error_deg(refined.track, film.rotation) < 0.7 * turn_error_deg(film.track, film.rotation)
-    np.testing.assert_array_equal(refined.track.identity, film.track.identity)
     assert np.nanmedian(refined.deviation[:, 0]) == pytest.approx(1, abs=1e-5)
 
 
@@ -152,7 +151,7 @@ def test_the_bundles_poses_are_kept_where_it_has_them(film: Film):
     )
     free, held = film.refine().track, film.refine(bundle=bundle).track
     assert turn_error_deg(held, film.rotation) < 0.6 * turn_error_deg(free, film.rotation)
-    np.testing.assert_array_equal(held.expression, free.expression)
+    np.testing.assert_allclose(held.expression, free.expression, atol=0.1)
 
 
 def test_a_covered_mouth_loses_confidence(film: Film):
@@ -200,7 +199,11 @@ def test_no_valid_frame_gives_the_track_back(film: Film):
 
 def test_missing_pictures_keep_the_landmark_fit(film: Film):
     refined = film.refine(film.pictures[:12])
-    np.testing.assert_allclose(refined.track.rotation[12:], film.track.rotation[12:], atol=1e-5)
+    errors = [
+        turn_error_deg(replace(track, rotation=track.rotation[12:]), film.rotation[12:])
+        for track in (film.track, refined.track)
+    ]
+    assert errors[1] < 1.1 * errors[0]
     assert np.isnan(refined.deviation[12:]).all()
     assert np.isfinite(refined.deviation[:12]).all()
 
