@@ -101,6 +101,17 @@ class LandmarkModel:
         """Number of modes."""
         return len(self.modes)
 
+    def touching(self, pairs: Sequence[tuple[int, int]]) -> F64:
+        """[..] m, `touch` of some of LIP_PAIRS or LID_PAIRS; 0 for one that the fit does not use."""
+        named = [tuple(pair) for pair in self.landmarks[self.pairs].tolist()]
+        return np.array([self.touch[named.index(pair)] if pair in named else 0.0 for pair in pairs])
+
+    def of_lids(self) -> NDArray[np.bool_]:
+        """[K] modes that move nothing more than a lid's rim."""
+        lids = np.isin(self.landmarks, np.array(LID_PAIRS))
+        farthest = np.linalg.norm(self.expression, axis=2).argmax(1)
+        return np.asarray(lids[farthest])
+
     def heights(self, points: F64) -> F64:
         """[.., Q] of each pair's upper landmark above its lower one, of points or movements [.., L, 3]."""
         upper, lower = self.pairs.T

@@ -98,7 +98,7 @@ def refine_track(
     for start, part in _stretches(cuts, len(good)):
         rows = np.array(list(part))
         smoothness = smoothness_between(
-            subject.energy, landmarks.time, good[rows], segment, photometry.smoothness
+            subject.energy, landmarks.time, good[rows], segment, subject.smoothness
         )
         found, before, after = fit_stretch(subject, levels, list(part.values()), rows, x[rows], smoothness)
         better = np.isfinite(found).all(1) & (after[:, 0] < before[:, 0])

@@ -49,7 +49,8 @@ class Photometry:
     edge_blurs: float = 1.0
     """Skin nearer to the mouth's inside than so many standard deviations of a blur shows teeth and dark as well."""
     smoothness: float = 20.0
-    """Factor on the landmark fit's smoothness: the skin shows motion so much finer than landmarks do."""
+    """Factor on the landmark fit's smoothness, but of the lids', which shut in two frames and are no skin compared: the
+    skin shows motion so much finer than landmarks do."""
     steps: int = 2
     """Gauss-Newton steps at each blur."""
     reopening: int = 3
@@ -100,6 +101,12 @@ class Subject:
         """The same with another identity [Ki]."""
         subject = identity.astype(np.float32)
         return replace(self, identity=subject, skin=skin_of(self.head, self.energy.model, subject))
+
+    @property
+    def smoothness(self) -> F64:
+        """[U] factor on the landmark fit's smoothness."""
+        free = np.append(self.energy.model.of_lids(), np.zeros(POSE, bool))
+        return np.where(free, 1.0, self.photometry.smoothness)
 
     @property
     def px_per_m(self) -> float:

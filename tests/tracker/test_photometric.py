@@ -12,7 +12,7 @@ from tracker.energy import POSE, Energy, Weights, landmark_model
 from tracker.flame import flame_head
 from tracker.head import load_head
 from tracker.photometric import PhotometricEnergy
-from tracker.skin_fit import LEAST_NOISE, grey_noise
+from tracker.skin_fit import LEAST_NOISE, Photometry, Subject, grey_noise
 from tracker.view import View, Window
 
 HEAD = load_head()
@@ -159,6 +159,16 @@ def test_skin_moves_as_a_flame_head_does():
     np.testing.assert_allclose(skin.rest + skin.expression @ weights + model.centre, expected, atol=3e-4)
     assert skin.mouth.any() and not skin.mouth.all()
     np.testing.assert_allclose(model.modes.of_head(expression, jaw), weights, atol=1e-6)
+
+
+def test_lids_move_as_fast_as_the_landmarks_say(energy_and_x):
+    window = Window(np.zeros((1, 2)), 1.0, SIZE)
+    skin = energy_and_x[0]
+    subject = Subject(HEAD, IDENTITY, skin.landmarks, skin.skin, window, Photometry(smoothness=20.0))
+    factor = dict(zip(HEAD.expression_names, subject.smoothness))
+    assert factor["eyeBlinkLeft"] == factor["eyeLookDownRight"] == 1
+    assert factor["jawOpen"] == factor["mouthPressLeft"] == factor["browInnerUp"] == 20
+    assert (subject.smoothness[-POSE:] == 20).all()
 
 
 def test_only_the_mouth_has_noise_of_its_own():
