@@ -21,7 +21,7 @@ MOST = 0.003  # m: lids read wider than this in blinks do not shut in them
 def lids_shut(observed: F64, px_per_m: F64, touch: F64, sound: Index) -> F64:
     """Landmarks [n, 478, 2] px with lids that shut when the subject blinks; as they are if that does not show.
 
-    px_per_m: [n]. touch: [14] m, between the landmarks of each of LID_PAIRS where lids touch. sound: rows of bare faces.
+    px_per_m: [n]. touch: [14] m, between the landmarks of LID_PAIRS where lids touch. sound: rows of bare faces.
     """
     upper, lower = np.transpose(LID_PAIRS)
     apart = observed[:, lower] - observed[:, upper]
