@@ -77,8 +77,8 @@ class SubjectEnergy:
         grey = skin.grey(x)
         return skin.loss(grey - self.light * self._albedo(grey))[0]
 
-    def linearize(self, shape: F64, x: F64, with_identity: bool = True) -> Quadratic:
-        """Gauss-Newton model of the unknowns [identity (Ki), x].
+    def linearize(self, shape: F64, x: F64, with_identity: bool = False) -> Quadratic:
+        """Gauss-Newton model at x [n, U]; with identity the unknowns are [identity (Ki), x].
 
         What a frame's own x does to the albedo, a share of one in n, is left out.
         """
@@ -90,8 +90,9 @@ class SubjectEnergy:
         loss, precision = skin.loss(residual)
         root = np.sqrt(precision)
         pose = rotation_matrix(x[:, -6:-3]).astype(np.float32), left_jacobian(x[:, -6:-3]).astype(np.float32)
-        moves = np.concatenate([self.moves, skin.skin.expression], axis=2)
-        count, gradient, hessian = self.moves.shape[2], known.gradient.copy(), known.hessian.copy()
+        identity = self.moves if with_identity else self.moves[:, :, :0]
+        moves = np.concatenate([identity, skin.skin.expression], axis=2)
+        count, gradient, hessian = identity.shape[2], known.gradient.copy(), known.hessian.copy()
         for start in range(0, len(moves), BLOCK):
             part = np.s_[:, start : start + BLOCK]
             rows = np.empty((*residual[part].shape, 1, moves.shape[2] + POSE), np.float32)
