@@ -101,11 +101,6 @@ class LandmarkModel:
         """Number of modes."""
         return len(self.modes)
 
-    def touching(self, pairs: Sequence[tuple[int, int]]) -> F64:
-        """[..] m, `touch` of some of LIP_PAIRS or LID_PAIRS; 0 for one that the fit does not use."""
-        named = [tuple(pair) for pair in self.landmarks[self.pairs].tolist()]
-        return np.array([self.touch[named.index(pair)] if pair in named else 0.0 for pair in pairs])
-
     def of_lids(self) -> NDArray[np.bool_]:
         """[K] modes that move nothing more than a lid's rim."""
         lids = np.isin(self.landmarks, np.array(LID_PAIRS))

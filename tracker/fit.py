@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from tracker.confidence import confidence
 from tracker.energy import (
-    LID_PAIRS,
     LIP_PAIRS,
     POSE,
     Energy,
@@ -27,7 +26,6 @@ from tracker.energy import (
 )
 from tracker.gaze import eye_rotations
 from tracker.key_frames import key_frames
-from tracker.lid_opening import lids_shut
 from tracker.rigid_pose import hold_poses
 from tracker.solver import Smoothness, solve_frames, solve_subject
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track, TrackError
@@ -68,7 +66,6 @@ def fit_track(
     observed = camera.lens.points(landmarks.points[good][..., :2])
     energy, start = _start(model, weights, camera, observed, landmarks.points[good])
     share, sound = _share(evidence, good), trusted(evidence, good)
-    energy, observed = _with_lids_shut(energy, observed, sound)
     rest, other = (sound[rows] for rows in key_frames(observed[sound], energy.px_per_m[sound]))
     energy = with_lips_shut(energy, start, rest)
     identity = fit_identity(energy, start, (rest, other))
@@ -160,12 +157,6 @@ def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
     return replace(energy, model=replace(model, mean=mean, touch=touch))
 
 
-def _with_lids_shut(energy: Energy, observed: F64, sound: Frames) -> tuple[Energy, F64]:
-    """Energy and landmarks [n, 478, 2] px where blinks shut the eyes, see `lids_shut`."""
-    observed = lids_shut(observed, energy.px_per_m, energy.model.touching(LID_PAIRS), sound)
-    return replace(energy, observed=observed[:, energy.model.landmarks]), observed
-
-
 def fit_identity(energy: Energy, start: F64, keys: tuple[Frames, Frames]) -> F64:
     """[Ki] the subject, from frames at rest, whose expressions are held near zero, and from others."""
     rest, other = keys
@@ -215,9 +206,7 @@ def resume(
     energy = _energy(model, weights, camera, observed, camera.focal_px / translation[:, 2], x)
     energy = replace(energy, visible=energy.visible * _share(evidence, good)[:, None])
     if len(good):
-        sound = trusted(evidence, good)
-        energy, observed = _with_lids_shut(energy, observed, sound)
-        energy = with_lips_shut(energy, x, at_rest(observed, energy.px_per_m, sound))
+        energy = with_lips_shut(energy, x, at_rest(observed, energy.px_per_m, trusted(evidence, good)))
     return energy, x, observed, good
 
 
