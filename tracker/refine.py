@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 # Frames that tell the albedo, half as many the identity: so many at least and at most, and no more than one of
 # KEYS_APART, since each costs as much as three fits.
-KEYS, KEYS_APART = (12, 48), 3
+KEYS, KEYS_APART = (12, 48), 5
 STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
 HALFWAY = 0.5  # to the bundle's poses: grey levels err as much, but slowly, and the tracks at random
 HELD_BYTES = 256 << 20  # of cut-out faces, about 100 s of them; a longer clip is read twice instead
