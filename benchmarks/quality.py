@@ -7,7 +7,9 @@ penalty that val chose before. With --trained nothing is trained: it is the run'
 
 r               of the lip opening with the reference: mean of 10 samples at s = 1, and of the ridge regression from the
                 same speech features on the same seconds; `training` is on the training seconds
-sd              over samples at s = 0.5 by the motion's own: lip opening, mouth width, eyelid opening
+sd              over samples at s = 0.5 by the motion's own: lip opening, mouth width, eyelid opening; mean over frames
+rms             the same as root of the mean variance, as the motion's own is one: what happens in few frames, as a
+                blink, counts for little in the mean of deviations
 speed           mean change from frame to frame of the same three, by the subject's own: noise is no variety
 blinks          a minute, of samples; behind it the subject's own in what is tested and in what is learned from
 spread, velocity    of samples, by the subject's own; at s = 0 without the speech
@@ -72,6 +74,7 @@ def together(checkpoint: Checkpoint, drawn: list[F32], sequences: list[Sequence]
     figures["r"] = lip_gap_r(ours["lips"].mean(0), true["lips"])
     for name in ours:
         figures[f"sd {name}"] = float(ours[name].std(0).mean() / true[name].std())
+        figures[f"rms {name}"] = float(np.sqrt(ours[name].var(0).mean()) / true[name].std())
         figures[f"speed {name}"] = float(
             np.abs(np.diff(ours[name])).mean() / np.abs(np.diff(true[name])).mean()
         )
@@ -111,10 +114,11 @@ def report(
     print(f"r     mean of {SAMPLES}, s = 1: {at[1.0]['r']:.3f}   ridge {predicted['r']:.3f}", end="   ")
     print(f"single {at[1.0]['lip_gap_r']:.3f}   training {known['r']:.3f}")
     for s, row in at.items():
-        sds, speeds = (
-            "   ".join(f"{name} {row[f'{kind} {name}']:.2f}" for name in SIGNALS) for kind in ("sd", "speed")
+        sds, rms, speeds = (
+            "   ".join(f"{name} {row[f'{kind} {name}']:.2f}" for name in SIGNALS)
+            for kind in ("sd", "rms", "speed")
         )
-        print(f"s = {s}   sd {sds}   speed {speeds}", end="   ")
+        print(f"s = {s}   sd {sds}   rms {rms}   speed {speeds}", end="   ")
         print(f"spread {row['spread']:.2f}   velocity {row['velocity']:.2f}", end="   ")
         print(f"blinks {blinks_a_minute(checkpoint, samples[s], test):.1f} ({own:.1f}, {learned:.1f})")
     print(f"ridge     spread {predicted['spread']:.2f}   velocity {predicted['velocity']:.2f}", flush=True)
