@@ -53,7 +53,7 @@ class Photometry:
     skin shows motion so much finer than landmarks do."""
     steps: int = 2
     """Gauss-Newton steps at each blur."""
-    reopening: int = 3
+    refitting: int = 3
     """Steps of the landmark fit after identity and openings have been read from the pictures."""
     steadying: int = 2
     """Rounds in which the key frames tell what would move them all alike."""
@@ -155,7 +155,7 @@ class Subject:
 def fit_landmarks(subject: Subject, x: F64, smoothness: Smoothness) -> F64:
     """All frames from x [n, U] on, by landmarks alone, which have changed since, or the identity has."""
     shape = subject.energy.shape(subject.identity.astype(np.float64))
-    return solve_frames(subject.energy, shape, x, smoothness, steps=subject.photometry.reopening)[0]
+    return solve_frames(subject.energy, shape, x, smoothness, steps=subject.photometry.refitting)[0]
 
 
 def learn_levels(subject: Subject, cuts: Sequence[U8], rows: Index, x: F64) -> list[Level]:
