@@ -43,6 +43,11 @@ MISTAKEN = 0.25  # share of what is inside that looks more like lips: above, the
 DOUBT = 1.0  # log likelihood ratio up to which a colour tells nothing: a tongue is nearly that of lips
 TRUSTED = 3.0  # the most that one sample counts, as log likelihood ratio
 PRIOR_MM = 1.0  # standard deviation of width and middle about the landmarks'
+# Of a grey level, about. Lens and motion mix light, not the logarithms of colours.
+LIGHT = (np.arange(256, dtype=np.float32) / 255) ** 2
+BESIDE_MM = (0.8, 2.0)  # from an edge: what is on either side of it
+DARKNESS = 0.33  # of the lip's light: what has less is dark
+LIT_REACH_MM = 1.2  # from the colours' edge
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,8 @@ class LipLines:
 def lip_widths(colours: U8, marks: F64, sound: Index) -> F64 | None:
     """[n, Q] mm between the lips, of colours [n, Q, S, 3] u8 along lines with the landmarks' marks [n, Q, 4].
 
-    The expectation over all places of both edges, under the colours' classes and a weak prior about the landmarks.
+    The expectation over all places of both edges, under the colours' classes and a weak prior about the landmarks;
+    then the lower lip begins where the light says so, if what is above it is dark.
     sound: rows whose colours are the face's own. None where they do not tell lips from what is between them.
     """
     if not len(sound):
@@ -111,7 +117,8 @@ def lip_widths(colours: U8, marks: F64, sound: Index) -> F64 | None:
     widths = np.empty(marks.shape[:2])
     for rows in np.array_split(np.arange(len(colours)), max(1, len(colours) // LEARNED)):
         seen = _bins(_colour_axes(colours[rows], marks[rows]), low, scale)
-        _expected_widths(table[:, seen], SAMPLES, marks[rows], widths[rows[0] : rows[-1] + 1])
+        light = LIGHT[colours[rows]].mean(-1)
+        _expected_widths(table[:, seen], light, SAMPLES, marks[rows], widths[rows[0] : rows[-1] + 1])
     return widths
 
 
@@ -160,8 +167,11 @@ def _likelihoods(bins: NDArray[np.int32], classes: NDArray[np.int8]) -> F32 | No
 
 
 @njit(cache=True)
-def _expected_widths(likelihood, samples, marks, widths):  # type: ignore[no-untyped-def]
-    """Fills widths [n, Q] mm from log likelihoods [3, n, Q, S] at samples [S] mm; marks: [n, Q, 4] mm."""
+def _expected_widths(likelihood, light, samples, marks, widths):  # type: ignore[no-untyped-def]
+    """Fills widths [n, Q] mm from log likelihoods [3, n, Q, S] and light [n, Q, S] at samples [S] mm.
+
+    marks: [n, Q, 4] mm.
+    """
     before = np.zeros((3, len(samples) + 1))  # of all samples before an edge, class by class
     for n in range(marks.shape[0]):
         for q in range(marks.shape[1]):
@@ -170,14 +180,17 @@ def _expected_widths(likelihood, samples, marks, widths):  # type: ignore[no-unt
                 known = above <= samples[s] <= below
                 for c in range(3):
                     before[c, s + 1] = before[c, s] + (likelihood[c, n, q, s] if known else 0.0)
-            widths[n, q] = _expected_width(before, samples[0] - STEP_MM / 2, upper, lower)
+            first, last = _expected_edges(before, samples[0] - STEP_MM / 2, upper, lower)
+            if last - first > OPEN_MM:
+                last = _lit_edge(light[n, q], samples, last)
+            widths[n, q] = max(last - first, 0.0)
 
 
 @njit(cache=True)
-def _expected_width(before, start, upper, lower):  # type: ignore[no-untyped-def]
-    """Mean width over all pairs of edges, upper first; edge k lies at start + k steps."""
+def _expected_edges(before, start, upper, lower):  # type: ignore[no-untyped-def]
+    """Mean places of the upper and the lower edge over all pairs, upper first; edge k lies at start + k steps."""
     edges = before.shape[1]
-    best, total, mean = -np.inf, 0.0, 0.0
+    best, total, above, below = -np.inf, 0.0, 0.0, 0.0
     for first in range(edges):
         for last in range(first, edges):
             width = (last - first) * STEP_MM
@@ -191,7 +204,34 @@ def _expected_width(before, start, upper, lower):  # type: ignore[no-untyped-def
                 - away / (2 * PRIOR_MM**2)
             )
             if value > best:
-                total, mean, best = total * np.exp(best - value), mean * np.exp(best - value), value
+                less = np.exp(best - value)
+                total, above, below, best = total * less, above * less, below * less, value
             share = np.exp(value - best)
-            total, mean = total + share, mean + share * width
-    return mean / total
+            total, above, below = total + share, above + share * first, below + share * last
+    return start + STEP_MM * above / total, start + STEP_MM * below / total
+
+
+@njit(cache=True)
+def _lit_edge(light, samples, edge):  # type: ignore[no-untyped-def]
+    """Where the light [S] rises half way from darkness to the lower lip; the edge itself if nothing is dark there.
+
+    Half a pixel of lip in the dark is lip by its logarithm, so that colours end a dark mouth too early. Below the upper
+    lip there are teeth.
+    """
+    near, far = BESIDE_MM
+    dark, lip, darks, lips = 0.0, 0.0, 0, 0
+    for s in range(len(samples)):
+        if near <= samples[s] - edge <= far:
+            lip, lips = lip + light[s], lips + 1
+        elif near <= edge - samples[s] <= far:
+            dark, darks = dark + light[s], darks + 1
+    if not (lips and darks) or dark / darks > DARKNESS * lip / lips:
+        return edge
+    half = (dark / darks + lip / lips) / 2
+    found = edge + LIT_REACH_MM
+    for s in range(len(samples) - 1):
+        if light[s] <= half < light[s + 1]:
+            at = samples[s] + STEP_MM * (half - light[s]) / (light[s + 1] - light[s])
+            if abs(at - edge) < abs(found - edge):
+                found = at
+    return found if abs(found - edge) < LIT_REACH_MM else edge

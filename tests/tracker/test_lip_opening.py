@@ -5,7 +5,7 @@ import pytest
 
 from tracker.energy import LIP_PAIRS, POSE
 from tracker.landmark_indices import POINTS
-from tracker.lip_opening import OUTER_PAIRS, SAMPLES, LipLines, lip_widths
+from tracker.lip_opening import OUTER_PAIRS, SAMPLES, LipLines, _lit_edge, lip_widths
 
 FRAMES, LIP_MM = 80, 7.0
 ALL = np.arange(FRAMES)
@@ -19,16 +19,23 @@ UPPER, LOWER, TOOTH, DARK, SKIN = (
 
 
 def painted(
-    width: np.ndarray, inside: tuple[tuple[int, int, int], ...] = (TOOTH, DARK), gain: float = 1.0
+    width: np.ndarray,
+    inside: tuple[tuple[int, int, int], ...] = (TOOTH, DARK),
+    gain: float = 1.0,
+    soft_mm: float = 0.8,
+    power: float = 1.0,
 ) -> np.ndarray:
-    """[n, 9, S, 3] u8: upper lip, teeth above darkness, lower lip along lines whose openings are width [n, 9] mm."""
+    """[n, 9, S, 3] u8: upper lip, teeth above darkness, lower lip along lines whose openings are width [n, 9] mm.
+
+    soft_mm: over which one passes into the next. power: of the grey levels that mix there, 2 for light.
+    """
     rng = np.random.default_rng(1)
     edge = np.stack([-width / 2 - LIP_MM, -width / 2, 0 * width, width / 2, width / 2 + LIP_MM], axis=-1)
-    colours = np.array([SKIN, UPPER, inside[0], inside[-1], LOWER, SKIN], np.float64)
+    colours = np.array([SKIN, UPPER, inside[0], inside[-1], LOWER, SKIN], np.float64) ** power
     # Each sample sees a little of its neighbours: edges are soft.
-    share = np.clip((SAMPLES - edge[..., None]) / 0.8 + 0.5, 0, 1)
+    share = np.clip((SAMPLES - edge[..., None]) / soft_mm + 0.5, 0, 1)
     steps = np.diff(colours, axis=0)
-    picture = colours[0] + np.einsum("nqes,ec->nqsc", share, steps)
+    picture = (colours[0] + np.einsum("nqes,ec->nqsc", share, steps)) ** (1 / power)
     return np.clip(gain * picture + rng.normal(size=picture.shape) * 4, 0, 255).astype(np.uint8)
 
 
@@ -51,6 +58,19 @@ def test_colours_halve_the_landmarks_error(openings: tuple[np.ndarray, np.ndarra
     widths = lip_widths(painted(true), marked(seen), ALL)
     assert (widths - true).std() < 0.5 * (seen - true).std()
     assert np.corrcoef(widths.ravel(), true.ravel())[0, 1] > 0.99
+
+
+@pytest.mark.parametrize(("above", "found"), [(0.02, 3.1), (0.2, 2.6)])
+def test_the_lower_lip_begins_where_half_of_its_light_is_seen(above: float, found: float):
+    light = above + (0.4 - above) * np.clip(SAMPLES - 3.1 + 0.5, 0, 1)
+    assert _lit_edge(light, SAMPLES, 2.6) == pytest.approx(found, abs=0.1)
+
+
+def test_a_dark_mouth_is_not_read_narrower_than_its_light_tells():
+    true = np.tile(np.linspace(4, 9, FRAMES)[:, None], 9)
+    soft = painted(true, inside=(DARK, DARK), soft_mm=2.0, power=2.0)
+    # Of what the logarithm takes off, a third of a millimetre at either lip, the upper one's is left.
+    assert -0.45 < (lip_widths(soft, marked(true), ALL) - true).mean() < 0
 
 
 def test_shut_lips_stay_shut(openings: tuple[np.ndarray, np.ndarray]):
