@@ -22,9 +22,19 @@ NOISE = 0.0035  # of the outer-eye distance, which is about 0.09 m
 
 
 class Talker:
-    """A person of the head model who talks, blinks, looks about and turns the head for T frames."""
+    """A person of the head model who talks, blinks, looks about and turns the head for T frames.
 
-    def __init__(self, frames: int, seed: int = 0, noise: float = NOISE, turn: Rotation | None = None):
+    held: frames in which the face is held in the weights of these shapes instead.
+    """
+
+    def __init__(
+        self,
+        frames: int,
+        seed: int = 0,
+        noise: float = NOISE,
+        turn: Rotation | None = None,
+        held: tuple[slice, dict[str, float]] | None = None,
+    ):
         rng = np.random.default_rng(seed)
         t = np.arange(frames) / 25
         self.identity = 0.6 * rng.normal(size=len(HEAD.identity_basis)).astype(np.float32)
@@ -40,6 +50,8 @@ class Talker:
             self.expression[:, NAMES.index(name)] = size * np.clip(
                 np.sin(2 * np.pi * hertz * t + len(name)), 0, 1
             )
+        if held is not None:
+            self.expression[held[0]] = [held[1].get(name, 0.0) for name in NAMES]
         self.eyes = np.zeros((frames, 2, 3), np.float32)
         self.eyes[..., 1] = np.radians(12) * np.sin(3 * t)[:, None]
         if turn is None:
@@ -172,6 +184,32 @@ def test_lips_and_lids_do_not_pass_each_other():
     shape = model.mean + np.tensordot(track.identity, model.identity, axes=1)
     face = shape + np.tensordot(track.expression, model.expression, axes=1)
     assert (model.heights(face) - model.touch).min() > -2e-4
+
+
+@pytest.mark.parametrize(
+    "shapes",
+    [{"mouthPressLeft": 0.8, "mouthPressRight": 0.8}, {"mouthRollLower": 0.6, "mouthRollUpper": 0.6}],
+)
+def test_pressed_and_rolled_lips_are_thin_and_shut_and_do_not_cross(shapes: dict[str, float]):
+    silent = slice(20, 40)
+    talker = Talker(60, seed=2, noise=0.001, held=(silent, shapes))
+    # The head's own rolled lips pass through each other: where they cross, a detector sees one line.
+    upper, lower = np.transpose(LIP_PAIRS)
+    points = talker.landmarks.points.copy()
+    crossed = (points[:, upper, 1] > points[:, lower, 1])[..., None]
+    line = (points[:, upper] + points[:, lower]) / 2
+    points[:, upper] = np.where(crossed, line, points[:, upper])
+    points[:, lower] = np.where(crossed, line, points[:, lower])
+    track = talker.fit(landmarks=replace(talker.landmarks, points=points))
+    vertices = HEAD.vertices(track.identity, track.expression)[silent]
+    edges = (HEAD.regions[f"inner_lip_{lip}"] for lip in ("upper", "lower"))
+    above, below = (vertices[:, edge, 1] for edge in edges)
+    assert np.abs(track.lip_gap_mm[silent]).max() < 0.2
+    assert (above - below).min() > -2e-4 and (above - below).max() < 1e-3
+    places = HEAD.landmark_embedding.landmarks.tolist()
+    fitted = HEAD.landmark_positions(track.identity, track.expression)
+    thickness = fitted[:, places.index(0), 1] - fitted[:, places.index(17), 1]
+    assert thickness[silent].mean() < thickness[: silent.start].min() - 1.5e-3
 
 
 def test_gaze_follows_the_irises(talker, track):
