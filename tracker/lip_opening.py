@@ -34,6 +34,7 @@ LEAST_RANGE = 0.1  # of log colour along an axis: below, it is noise
 RARE = 0.01  # share of colours that have never been seen in a class
 UPPER, INSIDE, LOWER = range(3)
 LEARNED = 400  # frames, spread over the clip, that tell the colours
+ROUNDS = 3  # in which they tell how high the mouth is
 OPEN_MM = 2.5  # lips farther apart than this show what is inside
 # From the landmarks' edges, where either may be seen. They lie outside more often than inside: wide openings are read
 # wider still, by about a tenth.
@@ -100,26 +101,68 @@ class LipLines:
 def lip_widths(colours: U8, marks: F64, sound: Index) -> F64 | None:
     """[n, Q] mm between the lips, of colours [n, Q, S, 3] u8 along lines with the landmarks' marks [n, Q, 4].
 
-    The expectation over all places of both edges, under the colours' classes and a weak prior about the landmarks;
-    then the lower lip begins where the light says so, if what is above it is dark.
-    sound: rows whose colours are the face's own. None where they do not tell lips from what is between them.
+    The landmarker sees a whole mouth too high or too low: what the edges found in the colours tell of that is taken out
+    of the marks before they teach the colours again. sound: rows whose colours are the face's own. None where they do
+    not tell lips from what is between them.
     """
     if not len(sound):
         return None
     learned = sound[np.unique(np.linspace(0, len(sound) - 1, LEARNED).round().astype(int))]
-    axes = _colour_axes(colours[learned], marks[learned])
-    low, high = np.quantile(axes.reshape(-1, 3), (0.005, 0.995), axis=0)
-    scale = BINS / np.maximum(high - low, LEAST_RANGE)
-    classes = _classes(marks[learned])
-    table = _likelihoods(_bins(axes, low, scale), classes)
-    if table is None:
+    taught, lower = colours[learned], 0.0
+    for _ in range(ROUNDS):
+        moved = _moved(marks[learned], lower)
+        if (known := LipColours.of(taught, moved)) is None:
+            return None
+        lower += _lower(known.edges(taught, moved), moved)
+    moved = _moved(marks, lower)
+    if (known := LipColours.of(taught, moved[learned])) is None:
         return None
-    widths = np.empty(marks.shape[:2])
-    for rows in np.array_split(np.arange(len(colours)), max(1, len(colours) // LEARNED)):
-        seen = _bins(_colour_axes(colours[rows], marks[rows]), low, scale)
-        light = LIGHT[colours[rows]].mean(-1)
-        _expected_widths(table[:, seen], light, SAMPLES, marks[rows], widths[rows[0] : rows[-1] + 1])
-    return widths
+    parts = np.array_split(np.arange(len(colours)), max(1, len(colours) // LEARNED))
+    edges = np.concatenate([known.edges(colours[rows], moved[rows]) for rows in parts])
+    return np.maximum(edges[..., 1] - edges[..., 0], 0.0)
+
+
+@dataclass(frozen=True)
+class LipColours:
+    """How likely colours are upper lip, lower lip or what is between them, in one clip.
+
+    table: [3, BINS^3] log likelihoods of the bins of colour, which begin at low [3] and are 1 / scale [3] wide.
+    """
+
+    low: F64
+    scale: F64
+    table: F32
+
+    @classmethod
+    def of(cls, colours: U8, marks: F64) -> LipColours | None:
+        """What colours [n, Q, S, 3] are if the marks [n, Q, 4] are about right; None if that tells nothing."""
+        axes = _colour_axes(colours, marks)
+        low, high = np.quantile(axes.reshape(-1, 3), (0.005, 0.995), axis=0)
+        scale = BINS / np.maximum(high - low, LEAST_RANGE)
+        table = _likelihoods(_bins(axes, low, scale), _classes(marks))
+        return None if table is None else cls(low, scale, table)
+
+    def edges(self, colours: U8, marks: F64) -> F64:
+        """[n, Q, 2] mm along the lines: where the upper lip ends and the lower one begins.
+
+        The expectation over all places of both, under the colours and a weak prior about the marks; then the lower lip
+        begins where the light says so, if what is above it is dark.
+        """
+        seen = self.table[:, _bins(_colour_axes(colours, marks), self.low, self.scale)]
+        edges = np.empty((*marks.shape[:2], 2))
+        _fill_edges(seen, LIGHT[colours].mean(-1), SAMPLES, marks, edges)
+        return edges
+
+
+def _moved(marks: F64, lower: float) -> F64:
+    """The marks [n, Q, 4] with both inner edges lower by so many mm."""
+    return marks + np.array([0.0, lower, lower, 0.0])
+
+
+def _lower(edges: F64, marks: F64) -> float:
+    """mm by which edges [n, Q, 2] of open lips lie lower than the marks [n, Q, 4] have them."""
+    opened = marks[..., 2] - marks[..., 1] > OPEN_MM
+    return float(np.median((edges - marks[..., 1:3]).mean(-1)[opened])) if opened.any() else 0.0
 
 
 def _colour_axes(colours: U8, marks: F64) -> F32:
@@ -167,8 +210,8 @@ def _likelihoods(bins: NDArray[np.int32], classes: NDArray[np.int8]) -> F32 | No
 
 
 @njit(cache=True)
-def _expected_widths(likelihood, light, samples, marks, widths):  # type: ignore[no-untyped-def]
-    """Fills widths [n, Q] mm from log likelihoods [3, n, Q, S] and light [n, Q, S] at samples [S] mm.
+def _fill_edges(likelihood, light, samples, marks, edges):  # type: ignore[no-untyped-def]
+    """Fills edges [n, Q, 2] mm from log likelihoods [3, n, Q, S] and light [n, Q, S] at samples [S] mm.
 
     marks: [n, Q, 4] mm.
     """
@@ -183,7 +226,7 @@ def _expected_widths(likelihood, light, samples, marks, widths):  # type: ignore
             first, last = _expected_edges(before, samples[0] - STEP_MM / 2, upper, lower)
             if last - first > OPEN_MM:
                 last = _lit_edge(light[n, q], samples, last)
-            widths[n, q] = max(last - first, 0.0)
+            edges[n, q] = first, last
 
 
 @njit(cache=True)
