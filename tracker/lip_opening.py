@@ -108,13 +108,13 @@ def lip_widths(colours: U8, marks: F64, sound: Index) -> F64 | None:
     if not len(sound):
         return None
     learned = sound[np.unique(np.linspace(0, len(sound) - 1, LEARNED).round().astype(int))]
-    taught, lower = colours[learned], 0.0
+    taught, down = colours[learned], 0.0
     for _ in range(ROUNDS):
-        moved = _moved(marks[learned], lower)
+        moved = _moved(marks[learned], down)
         if (known := LipColours.of(taught, moved)) is None:
             return None
-        lower += _lower(known.edges(taught, moved), moved)
-    moved = _moved(marks, lower)
+        down += _down(known.edges(taught, moved), moved)
+    moved = _moved(marks, down)
     if (known := LipColours.of(taught, moved[learned])) is None:
         return None
     parts = np.array_split(np.arange(len(colours)), max(1, len(colours) // LEARNED))
@@ -154,13 +154,13 @@ class LipColours:
         return edges
 
 
-def _moved(marks: F64, lower: float) -> F64:
-    """The marks [n, Q, 4] with both inner edges lower by so many mm."""
-    return marks + np.array([0.0, lower, lower, 0.0])
+def _moved(marks: F64, down: float) -> F64:
+    """The marks [n, Q, 4] with both inner edges so many mm farther down."""
+    return marks + np.array([0.0, down, down, 0.0])
 
 
-def _lower(edges: F64, marks: F64) -> float:
-    """mm by which edges [n, Q, 2] of open lips lie lower than the marks [n, Q, 4] have them."""
+def _down(edges: F64, marks: F64) -> float:
+    """mm by which edges [n, Q, 2] of open lips lie farther down than the marks [n, Q, 4] have them."""
     opened = marks[..., 2] - marks[..., 1] > OPEN_MM
     return float(np.median((edges - marks[..., 1:3]).mean(-1)[opened])) if opened.any() else 0.0
 

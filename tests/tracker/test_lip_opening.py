@@ -73,10 +73,10 @@ def test_a_dark_mouth_is_not_read_narrower_than_its_light_tells():
     assert -0.45 < (lip_widths(soft, marked(true), ALL) - true).mean() < 0
 
 
-@pytest.mark.parametrize("lower", [-1.5, 1.5])
-def test_a_mouth_seen_too_high_or_too_low_is_as_wide(openings: tuple[np.ndarray, np.ndarray], lower: float):
+@pytest.mark.parametrize("down", [-1.5, 1.5])
+def test_a_mouth_seen_too_high_or_too_low_is_as_wide(openings: tuple[np.ndarray, np.ndarray], down: float):
     true, seen = openings
-    moved = marked(seen) + np.array([0, lower, lower, 0])
+    moved = marked(seen) + np.array([0, down, down, 0])
     np.testing.assert_allclose(
         lip_widths(painted(true), moved, ALL), lip_widths(painted(true), marked(seen), ALL), atol=0.4
     )
