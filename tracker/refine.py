@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from tracker.fit import at_rest, make_track, resume, runs, smoothness_between, trusted, with_lips_shut
 from tracker.key_frames import key_frames
-from tracker.lip_opening import LipLines, lip_widths
+from tracker.lip_lines import LipLines
+from tracker.lip_opening import lip_widths
 from tracker.rigid_pose import hold_poses
 from tracker.skin_fit import Photometry, Subject, fit_landmarks, fit_stretch, learn_levels
 from tracker.skin_identity import fit_identity_to_skin

@@ -1,0 +1,69 @@
+"""Lines across the mouth, one through each pair of inner-lip landmarks, and the colours of a picture along them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from tracker.energy import LIP_PAIRS, rotation_matrix
+from tracker.track import F64
+from tracker.view import U8, Index
+
+# Outer edges of the upper and the lower lip above and below each pair of the inner ones.
+OUTER_PAIRS = (
+    *((185, 146), (40, 91), (39, 181), (37, 84), (0, 17)),
+    *((267, 314), (269, 405), (270, 321), (409, 375)),
+)
+STEP_MM, REACH_MM = 0.4, 13.0  # of the samples along a line, to both sides of the inner lips' middle
+SAMPLES = np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM)
+BLUR = 0.6  # standard deviation in steps, and no less than LEAST_BLUR_PX
+LEAST_BLUR_PX = 0.5
+
+
+@dataclass(frozen=True)
+class LipLines:
+    """Lines across the mouth of n frames, one through each of the Q pairs of inner-lip landmarks, down the face.
+
+    middle: [n, Q, 2] px, between the pair. step: [n, 2] px per mm on the face. marks: [n, Q, 4] mm along the line:
+    outer upper, inner upper, inner lower and outer lower edge by the landmarks.
+    """
+
+    middle: F64
+    step: F64
+    marks: F64
+
+    @classmethod
+    def across(cls, observed: F64, px_per_m: F64, x: F64) -> LipLines:
+        """Through landmarks [n, 478, 2] px of faces of the scale px_per_m [n], in the poses of x [n, U]."""
+        up = rotation_matrix(x[:, -6:-3])[:, :2, 1]
+        step = -1e-3 * px_per_m[:, None] * up / np.linalg.norm(up, axis=1, keepdims=True)
+        (upper, lower), (above, below) = np.transpose(LIP_PAIRS), np.transpose(OUTER_PAIRS)
+        middle = (observed[:, upper] + observed[:, lower]) / 2
+        edges = (
+            np.stack([observed[:, row] for row in (above, upper, lower, below)], axis=2) - middle[:, :, None]
+        )
+        marks = np.einsum("nqex,nx->nqe", edges, step) / (step**2).sum(1)[:, None, None]
+        return cls(middle, step, marks)
+
+    def read(self, rgb: U8, row: int) -> U8:
+        """[Q, S, 3] u8: the colours of a picture [H, W, 3] along the lines of frame `row`."""
+        places = self.middle[row][:, None] + SAMPLES[:, None] * self.step[row]
+        size = np.array(rgb.shape[1::-1])
+        low = np.clip(np.floor(places.min((0, 1))).astype(int) - 4, 0, size - 1)
+        high = np.clip(np.ceil(places.max((0, 1))).astype(int) + 5, low + 1, size)
+        blur = max(BLUR * STEP_MM * float(np.linalg.norm(self.step[row])), LEAST_BLUR_PX)
+        mouth = cv2.GaussianBlur(rgb[low[1] : high[1], low[0] : high[0]], (0, 0), blur)
+        x, y = np.moveaxis((places - low).astype(np.float32), 2, 0)
+        return cv2.remap(mouth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def opened(self, observed: F64, rows: Index, widths: F64) -> F64:
+        """The landmarks [n, 478, 2] px with the inner lips of frames `rows` [m] moved `widths` [m, Q] mm apart."""
+        out = observed.copy()
+        more = (widths - (self.marks[rows, :, 2] - self.marks[rows, :, 1])) / 2
+        move = more[..., None] * self.step[rows, None]
+        upper, lower = np.transpose(LIP_PAIRS)
+        out[rows[:, None], upper] -= move
+        out[rows[:, None], lower] += move
+        return out
