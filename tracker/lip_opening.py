@@ -33,7 +33,7 @@ LEAST_INSIDE = 100  # samples; with fewer the clip hardly shows an open mouth
 MISTAKEN = 0.25  # share of what is inside that looks more like lips: above, the clip's colours tell nothing
 DOUBT = 1.0  # log likelihood ratio up to which a colour tells nothing: a tongue is nearly that of lips
 TRUSTED = 3.0  # the most that one sample counts, as log likelihood ratio
-PRIOR_MM = 1.0  # standard deviation of width and middle about the landmarks'
+PRIOR_MM = 1.0  # standard deviation of width and middle about the marks'
 # Of a grey level, about. Lens and motion mix light, not the logarithms of colours.
 LIGHT = (np.arange(256, dtype=np.float32) / 255) ** 2
 BESIDE_MM = (0.8, 2.0)  # from an edge: what is on either side of it
