@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.head_mesh import EYE_RINGS_DEG, EYE_SECTORS, EYES, IRIS_RING, Mesh, build_mesh
-from tools.head_shapes import EYE_DISTANCE, Seam, align, expressions, identity_modes, sample_people, seams
+from tools.head_shapes import EYE_DISTANCE, Seam, align, expressions, identity_modes, lip_profiles, sample_people, seams
 from tools.head_source import PACKAGE, Source
 
 F64 = NDArray[np.float64]
@@ -47,6 +47,8 @@ def build(source: Source) -> dict[str, NDArray[np.generic]]:
     template = joined["lips"].part_behind(joined["lips"].close(mean[:-3]))
     basis = joined["lips"].close(modes[:, :-3])
     names, shapes = expressions(source, mesh, template, joined)
+    more, profiles = lip_profiles(mesh, template, joined["lips"])
+    names, shapes = names + more, np.concatenate([shapes, profiles])
     regions = make_regions(source, mesh, template, joined)
     print(
         f"{mesh.count} vertices, {len(mesh.faces)} triangles; {MODES} modes hold {100 * share:.2f} % of the variance"

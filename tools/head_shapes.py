@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 
 from tools.head_mesh import LID_RINGS, LIP_RINGS, Mesh, Rings
 from tools.head_source import Source
+from tracker.modes import LIP_SHAPES
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -35,6 +37,9 @@ SEALED = (
     "mouthDimpleRight", "mouthStretchLeft", "mouthStretchRight", "mouthPressLeft", "mouthPressRight", "mouthLeft",
     "mouthRight", "cheekPuff",
 )  # fmt: skip
+
+# The lips' own shapes: how far apart at weight 1, and how far from the lips' edges the skin follows, m.
+LIP_SHAPE, LIP_REACH = 0.005, 0.008
 
 
 def mirrored(field: F64, mesh: Mesh) -> F64:
@@ -277,3 +282,22 @@ def _blink(blink: F64, template: F64, mesh: Mesh, lids: Seam) -> F64:
     distance = np.linalg.norm(offset, axis=1, keepdims=True)
     closed[near] = centre + offset * np.maximum(distance, radius + 4e-4) / distance
     return closed - template
+
+
+def lip_profiles(mesh: Mesh, template: F64, lips: Seam) -> tuple[list[str], F64]:
+    """Names and shapes [2, D, 3] m: the lips apart by a whole wave, and by one and a half, from corner to corner.
+
+    ARKit's shapes open every mouth with one profile. Half a wave is what they do: it would take their place.
+    """
+    sides = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    length = np.linalg.norm(template[sides[:, 0]] - template[sides[:, 1]], axis=1)
+    graph = csr_array((length, sides.T), (mesh.count, mesh.count))
+    edges = lips.upper[1:-1], lips.lower[1:-1]
+    upper, lower = (dijkstra(graph, directed=False, indices=edge, min_only=True) for edge in edges)
+    follow = np.exp(-((np.minimum(upper, lower) / LIP_REACH) ** 2)) * np.where(lower > upper, 1, -1)
+    right, left = template[lips.upper[[0, -1]], 0]
+    along = np.clip((template[:, 0] - right) / (left - right), 0, 1)
+    shapes = np.zeros((len(LIP_SHAPES), mesh.count, 3))
+    for shape, waves in zip(shapes, (2, 3)):
+        shape[:, 1] = LIP_SHAPE / 2 * follow * np.sin(waves * np.pi * along)
+    return list(LIP_SHAPES), shapes

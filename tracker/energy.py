@@ -62,6 +62,8 @@ class Weights:
     """The same for shapes that trade depth or side shift against pose, or that landmarks cannot see."""
     expression_sd: float = 0.5
     """Standard deviation of the Gaussian prior on an expression weight."""
+    lip_shape_sd: float = 0.6
+    """The same for the profile in which the lips open, of 5 mm."""
     signed_sd: float = 1.0
     """The same for shapes in standard deviations of either sign."""
     jaw_open_sd: float = 0.2

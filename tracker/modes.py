@@ -1,6 +1,6 @@
 """A head's movements as the fit solves them: linear modes with bounds and priors, and what they mean to the head.
 
-An embedded head gives its ARKit shapes, 0..1. A head of signed shapes gives those, with a Gaussian prior, and its jaw:
+An embedded head gives its ARKit shapes, 0..1, and two of the lips' profile, -1..1. A head of signed shapes gives those, with a Gaussian prior, and its jaw:
 opening and side turn, each as the displacement at a turn of JAW_STEP. That chord differs from the arc, at the chin, by
 0.6 mm at a jaw angle of 0.25 rad and 2.6 mm at 0.35 rad, mostly in depth; the fit keeps one solver for all heads.
 """
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 JAW_STEP, WIDEST_JAW = 0.2, 0.7  # rad
 # Shapes that trade depth or side shift against pose, or that landmarks cannot see.
+# The lips apart by two and three half waves from corner to corner, 5 mm at weight 1.
+LIP_SHAPES = ("lipsApart2", "lipsApart3")
 AMBIGUOUS = ("jawForward", "jawLeft", "jawRight", "mouthLeft", "mouthRight", "tongueOut", "cheekPuff")
 
 
@@ -28,7 +30,7 @@ class Modes:
     """K movements. Their prior is rate · w + precision · w² / 2 within lower <= w <= upper, all [K].
 
     to_head: [K, Ke + 3], expression weights and jaw (axis-angle, rad) of the head at weight 1.
-    expression_range: the bounds of the head's own expression weights.
+    expression_range: the bounds of the head's own expression weights, [Ke] each.
     """
 
     to_head: F64
@@ -36,7 +38,7 @@ class Modes:
     upper: F64
     rate: F64
     precision: F64
-    expression_range: tuple[float, float] = (0.0, 1.0)
+    expression_range: tuple[F64, F64]
 
     def __len__(self) -> int:
         return len(self.to_head)
@@ -68,8 +70,11 @@ def _arkit_modes(head: HeadModel, weights: Weights) -> Modes:
     to_head = np.eye(count, count + 3)
     to_head[names.index("mouthClose"), names.index("jawOpen")] = 1.0
     mean = np.array([weights.ambiguous_mean if n in AMBIGUOUS else weights.expression_mean for n in names])
-    precision = np.full(count, weights.expression_sd**-2)
-    return Modes(to_head, np.zeros(count), np.ones(count), 1.0 / mean, precision)
+    profile = np.isin(names, LIP_SHAPES)
+    rate = np.where(profile, 0.0, 1.0 / mean)
+    precision = np.where(profile, weights.lip_shape_sd, weights.expression_sd) ** -2.0
+    lower, upper = np.where(profile, -1.0, 0.0), np.ones(count)
+    return Modes(to_head, lower, upper, rate, precision, (lower, upper))
 
 
 def _signed_modes(head: HeadModel, weights: Weights) -> Modes:
@@ -85,7 +90,8 @@ def _signed_modes(head: HeadModel, weights: Weights) -> Modes:
         lower[shapes], upper[shapes] = 0.0, WIDEST_JAW / JAW_STEP
         # No exponential prior: the opening would go into the shapes, which have none.
         precision[shapes:] = (JAW_STEP / np.array([weights.jaw_open_sd, weights.jaw_side_sd])) ** 2
-    return Modes(to_head, lower, upper, np.zeros(count), precision, (-np.inf, np.inf))
+    anything = np.full(shapes, np.inf)
+    return Modes(to_head, lower, upper, np.zeros(count), precision, (-anything, anything))
 
 
 def movements(head: HeadModel) -> F32:

@@ -44,7 +44,7 @@ class Photometry:
 
     At 1 the skin opened lips by 1 to 3 mm on real clips that the eye sees shut, at .2 some by 1.5.
     """
-    pair_noise_share: float = 0.05
+    pair_noise_share: float = 0.02
     """What this grows by with the opening."""
     edge_blurs: float = 1.0
     """Skin nearer to the mouth's inside than so many standard deviations of a blur shows teeth and dark as well."""
