@@ -21,6 +21,7 @@ from tracker.head import load_head
 from tracker.landmark_indices import IBUG_51, INNER_LIP_LOWER, INNER_LIP_UPPER, LEFT_EYE, LIPS, RIGHT_EYE
 
 IDENTITIES, EXPRESSIONS = 300, 100
+ARKIT = 52  # shapes of the embedded head, of its 54
 NOSE_BROWS = (168, 6, 197, 195, 5, 4, 1, 2, 98, 327, 70, 63, 105, 66, 107, 336, 296, 334, 293, 300)
 EMBEDDED = tuple(
     dict.fromkeys((*NOSE_BROWS, *LEFT_EYE, *RIGHT_EYE, *LIPS, *INNER_LIP_UPPER, *INNER_LIP_LOWER))
@@ -57,7 +58,7 @@ class FakeFlame:
         weights[:count, 1] = 1 - weights[:count, 2]
         weights[count : count + 6, 3] = weights[count + 6 : count + 12, 4] = 1
         weights[count + 12 :] = [0.6, 0.4, 0, 0, 0]
-        mixed = rng.normal(size=(EXPRESSIONS, 52)) @ at(head.expression_basis).reshape(52, -1) / 30
+        mixed = rng.normal(size=(EXPRESSIONS, ARKIT)) @ at(head.expression_basis[:ARKIT]).reshape(ARKIT, -1) / 30
         shapes = np.zeros((IDENTITIES + EXPRESSIONS, len(template), 3))
         shapes[:100, :count] = at(head.identity_basis)
         shapes[100:300, :count] = 1e-5 * rng.normal(size=(200, count, 3))

@@ -70,7 +70,7 @@ class Weights:
     """Standard deviation of a jaw joint's opening, rad."""
     jaw_side_sd: float = 0.02
     """The same of its turn to the side."""
-    contact_mm: float = 0.15
+    contact_mm: float = 0.05
     """Standard deviation of how far lips, or lids, pass through each other."""
     rest: float = 30.0
     """Factor on the expression prior in frames at rest: identity, not expression, explains them."""

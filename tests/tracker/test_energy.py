@@ -22,8 +22,8 @@ IDENTITIES, EXPRESSIONS, POINTS = 4, 5, 30
 def random_modes() -> Modes:
     to_head = np.eye(EXPRESSIONS, EXPRESSIONS + 3)
     to_head[0, 1] = 1.0  # mouthClose carries jawOpen along
-    rest = np.zeros(EXPRESSIONS), np.ones(EXPRESSIONS)
-    return Modes(to_head, *rest, rate=np.full(EXPRESSIONS, 5.0), precision=np.full(EXPRESSIONS, 4.0))
+    bounds = np.zeros(EXPRESSIONS), np.ones(EXPRESSIONS)
+    return Modes(to_head, *bounds, np.full(EXPRESSIONS, 5.0), np.full(EXPRESSIONS, 4.0), bounds)
 
 
 def random_model(seed: int = 0) -> LandmarkModel:

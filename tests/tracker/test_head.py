@@ -9,10 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from tracker.energy import LIP_PAIRS
 from tracker.head import ASSET, HeadModel, load_head, read_head
+from tracker.modes import LIP_SHAPES
 from tracker.raster import rasterize
 from tracker.track import TrackError
 
 FLIP = np.array([-1, 1, 1], np.float32)
+SHAPES = 52 + len(LIP_SHAPES)
 REGIONS = {
     "lips", "inner_lip_upper", "inner_lip_lower", "face", "eyelids", "eyes", "forehead", "neck", "scalp", "teeth",
 }  # fmt: skip
@@ -40,9 +42,9 @@ def _people(head: HeadModel, count: int) -> np.ndarray:
 def test_shapes_types_and_names(head: HeadModel) -> None:
     count = len(head.template)
     assert head.template.dtype == np.float32 and head.faces.dtype == np.int32
-    assert head.identity_basis.shape == (100, count, 3) and head.expression_basis.shape == (52, count, 3)
+    assert head.identity_basis.shape == (100, count, 3) and head.expression_basis.shape == (SHAPES, count, 3)
     assert head.identity_basis.dtype == head.expression_basis.dtype == np.float32
-    assert len(set(head.expression_names)) == 52 and "jawOpen" in head.expression_names
+    assert len(set(head.expression_names)) == SHAPES and {"jawOpen", *LIP_SHAPES} <= set(head.expression_names)
     assert head.faces.min() == 0 and head.faces.max() == count - 1
     assert set(head.regions) >= REGIONS
     assert head.albedo.shape == (count, 3) and head.albedo.dtype == np.uint8
@@ -68,9 +70,9 @@ def test_faces_run_counter_clockwise_from_outside(head: HeadModel) -> None:
 
 
 def test_neutral_is_the_template_and_vertices_equal_the_sum(head: HeadModel) -> None:
-    nobody, rest = np.zeros(100), np.zeros(52)
+    nobody, rest = np.zeros(100), np.zeros(SHAPES)
     np.testing.assert_array_equal(head.vertices(nobody, rest), head.template)
-    identity, expression = _people(head, 1)[0], np.random.default_rng(0).uniform(0, 1, 52)
+    identity, expression = _people(head, 1)[0], np.random.default_rng(0).uniform(0, 1, SHAPES)
     expected = head.template.astype(float)
     for weight, shape in zip(identity, head.identity_basis):
         expected = expected + weight * shape
@@ -80,14 +82,14 @@ def test_neutral_is_the_template_and_vertices_equal_the_sum(head: HeadModel) -> 
 
 
 def test_leading_dimensions_broadcast(head: HeadModel) -> None:
-    expression = np.random.default_rng(1).uniform(0, 1, (2, 3, 52))
+    expression = np.random.default_rng(1).uniform(0, 1, (2, 3, SHAPES))
     eyes = np.random.default_rng(2).normal(0, 0.2, (2, 3, 2, 3))
     identity = _people(head, 1)[0]
     all_at_once = head.vertices(identity, expression, eyes=eyes)
     assert all_at_once.shape == (2, 3, *head.template.shape)
     one = head.vertices(identity, expression[1, 2], eyes=eyes[1, 2])
     np.testing.assert_allclose(all_at_once[1, 2], one, atol=1e-6)
-    assert head.vertices(_people(head, 4), np.zeros(52)).shape[0] == 4
+    assert head.vertices(_people(head, 4), np.zeros(SHAPES)).shape[0] == 4
 
 
 def test_everything_is_symmetric(head: HeadModel) -> None:
@@ -102,7 +104,10 @@ def test_everything_is_symmetric(head: HeadModel) -> None:
     shapes = dict(zip(head.expression_names, head.expression_basis))
     for name, shape in shapes.items():
         other = name.replace("Left", "@").replace("Right", "Left").replace("@", "Right")
-        np.testing.assert_allclose(shape[mirror] * FLIP, shapes[other], atol=5e-6, err_msg=name)
+        turned_round = -1 if name == "lipsApart2" else 1
+        np.testing.assert_allclose(
+            shape[mirror] * FLIP, turned_round * shapes[other], atol=5e-6, err_msg=name
+        )
     for mode in head.identity_basis:
         image = mode[mirror] * FLIP
         assert min(np.abs(image - mode).max(), np.abs(image + mode).max()) < 1e-5
@@ -117,7 +122,7 @@ def test_lips_touch_on_every_neutral_face_and_open_with_the_jaw(head: HeadModel)
     upper, lower = head.regions["inner_lip_upper"], head.regions["inner_lip_lower"]
     assert len(upper) == len(lower) and upper[0] == lower[0] and upper[-1] == lower[-1]
     assert (np.diff(head.template[lower, 0]) > 0).all()
-    neutral = head.vertices(_people(head, 40), np.zeros(52))
+    neutral = head.vertices(_people(head, 40), np.zeros(SHAPES))
     assert np.abs(head.lip_gap_mm(neutral)).max() < 0.15
     assert np.abs(neutral[:, upper] - neutral[:, lower]).max() < 2e-3
     opening = [
@@ -164,6 +169,23 @@ def test_lips_stay_shut(head: HeadModel, weights: dict[str, float]) -> None:
     assert np.abs(head.lip_gap_mm(vertices)).max() < 0.15
 
 
+@pytest.mark.parametrize(("name", "waves"), [("lipsApart2", 2), ("lipsApart3", 3)])
+def test_the_lips_profile_moves_lips_apart_in_waves_and_nothing_else(
+    head: HeadModel, name: str, waves: int
+) -> None:
+    shape = head.expression_basis[head.expression_names.index(name)]
+    upper, lower = head.regions["inner_lip_upper"], head.regions["inner_lip_lower"]
+    right, left = head.template[upper[[0, -1]], 0]
+    for lip, way in ((upper, 1), (lower, -1)):
+        along = (head.template[lip, 0] - right) / (left - right)
+        np.testing.assert_allclose(shape[lip, 1], way * 0.0025 * np.sin(waves * np.pi * along), atol=2e-5)
+    assert not shape[:, [0, 2]].any()
+    other = np.concatenate([head.regions[part] for part in ("teeth", "tongue", "eyes", "scalp", "ears")])
+    assert np.abs(shape[other]).max() < 1e-5
+    far = np.linalg.norm(head.template[:, None] - head.template[head.regions["lips"]], axis=2).min(1)
+    assert np.abs(shape[far > 0.015]).max() < 1e-4
+
+
 def test_a_full_blink_closes_the_eye_outside_the_ball(head: HeadModel) -> None:
     vertices = head.vertices(np.zeros(100), _weights(head, eyeBlink=1))
     for side in ("left", "right"):
@@ -178,7 +200,7 @@ def test_a_full_blink_closes_the_eye_outside_the_ball(head: HeadModel) -> None:
 def test_eyes_turn_about_their_centres_and_nothing_else_moves(head: HeadModel) -> None:
     identity = _people(head, 1)[0]
     turn = np.array([[0.1, 0.4, 0.0], [-0.2, 0.0, 0.05]])
-    still, turned = (head.vertices(identity, np.zeros(52), eyes=eyes) for eyes in (None, turn))
+    still, turned = (head.vertices(identity, np.zeros(SHAPES), eyes=eyes) for eyes in (None, turn))
     others = np.setdiff1d(np.arange(len(still)), head.regions["eyes"])
     np.testing.assert_array_equal(still[others], turned[others])
     for side, name in enumerate(("left_eye", "right_eye")):
@@ -191,16 +213,16 @@ def test_eyes_turn_about_their_centres_and_nothing_else_moves(head: HeadModel) -
 
 
 def test_jaw_and_neck_must_be_zero(head: HeadModel) -> None:
-    head.vertices(np.zeros(100), np.zeros(52), jaw=np.zeros(3), neck=np.zeros((5, 3)))
+    head.vertices(np.zeros(100), np.zeros(SHAPES), jaw=np.zeros(3), neck=np.zeros((5, 3)))
     with pytest.raises(TrackError, match="no jaw joint"):
-        head.vertices(np.zeros(100), np.zeros(52), jaw=[0.1, 0, 0])
+        head.vertices(np.zeros(100), np.zeros(SHAPES), jaw=[0.1, 0, 0])
 
 
 def test_landmarks_lie_on_the_mesh_and_follow_it(head: HeadModel) -> None:
     embedding = head.landmark_embedding
     assert len(embedding.landmarks) > 400 and set(embedding.landmarks) >= {13, 14, 33, 263, 61, 291, 468, 473}
     np.testing.assert_allclose(embedding.barycentric.sum(1), 1, atol=1e-5)
-    identity, expression = _people(head, 2)[:, None], np.random.default_rng(0).uniform(0, 1, (3, 52))
+    identity, expression = _people(head, 2)[:, None], np.random.default_rng(0).uniform(0, 1, (3, SHAPES))
     eyes = np.full((3, 2, 3), 0.2)
     points = head.landmark_positions(identity, expression, eyes=eyes)
     assert points.shape == (2, 3, len(embedding.landmarks), 3)
@@ -211,7 +233,7 @@ def test_landmarks_lie_on_the_mesh_and_follow_it(head: HeadModel) -> None:
 
 def test_inner_lip_landmarks_touch_on_the_neutral_face(head: HeadModel) -> None:
     row = {int(index): k for k, index in enumerate(head.landmark_embedding.landmarks)}
-    points = head.landmark_positions(np.zeros(100), np.zeros(52))
+    points = head.landmark_positions(np.zeros(100), np.zeros(SHAPES))
     for upper, lower in ((13, 14), (82, 87), (81, 178), (80, 88), (312, 317), (311, 402), (310, 318)):
         assert np.linalg.norm(points[row[upper]] - points[row[lower]]) < 1e-3
     left, right = points[row[263]], points[row[33]]
