@@ -58,7 +58,9 @@ class FakeFlame:
         weights[:count, 1] = 1 - weights[:count, 2]
         weights[count : count + 6, 3] = weights[count + 6 : count + 12, 4] = 1
         weights[count + 12 :] = [0.6, 0.4, 0, 0, 0]
-        mixed = rng.normal(size=(EXPRESSIONS, ARKIT)) @ at(head.expression_basis[:ARKIT]).reshape(ARKIT, -1) / 30
+        mixed = (
+            rng.normal(size=(EXPRESSIONS, ARKIT)) @ at(head.expression_basis[:ARKIT]).reshape(ARKIT, -1) / 30
+        )
         shapes = np.zeros((IDENTITIES + EXPRESSIONS, len(template), 3))
         shapes[:100, :count] = at(head.identity_basis)
         shapes[100:300, :count] = 1e-5 * rng.normal(size=(200, count, 3))

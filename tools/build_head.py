@@ -16,7 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.head_mesh import EYE_RINGS_DEG, EYE_SECTORS, EYES, IRIS_RING, Mesh, build_mesh
-from tools.head_shapes import EYE_DISTANCE, Seam, align, expressions, identity_modes, lip_profiles, sample_people, seams
+from tools.head_shapes import (
+    EYE_DISTANCE,
+    Seam,
+    align,
+    expressions,
+    identity_modes,
+    lip_profiles,
+    sample_people,
+    seams,
+)
 from tools.head_source import PACKAGE, Source
 
 F64 = NDArray[np.float64]

@@ -44,7 +44,9 @@ def test_shapes_types_and_names(head: HeadModel) -> None:
     assert head.template.dtype == np.float32 and head.faces.dtype == np.int32
     assert head.identity_basis.shape == (100, count, 3) and head.expression_basis.shape == (SHAPES, count, 3)
     assert head.identity_basis.dtype == head.expression_basis.dtype == np.float32
-    assert len(set(head.expression_names)) == SHAPES and {"jawOpen", *LIP_SHAPES} <= set(head.expression_names)
+    assert len(set(head.expression_names)) == SHAPES and {"jawOpen", *LIP_SHAPES} <= set(
+        head.expression_names
+    )
     assert head.faces.min() == 0 and head.faces.max() == count - 1
     assert set(head.regions) >= REGIONS
     assert head.albedo.shape == (count, 3) and head.albedo.dtype == np.uint8

@@ -1,0 +1,126 @@
+"""What can be told of tracks of real clips: `python -m benchmarks real_tracks RUN [RUN ...]`.
+
+The runs must have come as far as `refine`. There is no truth: the landmarks' own opening is what the eye would say
+first, and wrong in its own way.
+
+used        frames in use
+r, slope    of the lip opening with the raw landmarks', of the landmark fit and refined
+shut        the tenth of the frames whose raw lips are closest: median opening, 95 % and the largest, mm
+cuts        how many; residual in the second and the third frame after one, by the clip's median
+plosives    words that begin with b, p or m, by WORDS.json beside the video (`words`: word, start s): how many of them
+            have the fitted lips closed within one frame of the narrowest raw ones; for how many the middles of the
+            closures, raw and fitted, differ by one frame at most; the narrowest fitted opening, median and 90 %, mm
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.track_errors import CLOSED_MM
+from personalize import run as files
+from personalize.run import RunFolder
+from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
+from tracker.track import F64, Landmarks, Track
+
+EYES_MM = 90.0  # between the outer corners of the eyes, about
+AROUND_S = 0.16  # a word's first sound closes the lips so near to its start
+PLOSIVES = tuple("bpm")
+
+Bool = NDArray[np.bool_]
+
+
+def raw_openings(landmarks: Landmarks) -> F64:
+    """[T] mm between the inner lips' middles, by the distance of the eyes; NaN without a face."""
+    points = landmarks.points[..., :2].astype(np.float64)
+    eyes = np.linalg.norm(points[:, LEFT_EYE_OUTER] - points[:, RIGHT_EYE_OUTER], axis=-1)
+    return EYES_MM * np.linalg.norm(points[:, 13] - points[:, 14], axis=-1) / eyes
+
+
+def after_cuts(residual: F64, valid: Bool, segment: NDArray[np.int32]) -> tuple[float, float]:
+    """Residual [T] in the second and third frame of each shot but the first, by the clip's median; NaN without."""
+    starts = np.flatnonzero(np.diff(segment)) + 1
+    usual = np.median(residual[valid])
+    second, third = (starts + step for step in (1, 2))
+    means = [
+        float(residual[rows][valid[rows]].mean() / usual) if valid[rows].any() else np.nan
+        for rows in (part[part < len(residual)] for part in (second, third))
+    ]
+    return means[0], means[1]
+
+
+def closures(raw: F64, gap: F64, time: F64, valid: Bool, starts: list[float]) -> list[tuple[float, float]]:
+    """Of each word that starts at a moment in use: how closed the lips are, and how far from when they should be.
+
+    The narrowest gap [T] mm within a frame of the narrowest raw opening [T] mm; by how many frames the middles of both
+    closures, the frames within CLOSED_MM of the narrowest, differ.
+    """
+    found = []
+    for start in starts:
+        rows = np.flatnonzero(np.abs(time - start) < AROUND_S)
+        if not len(rows) or not (valid[rows] & np.isfinite(raw[rows])).all():
+            continue
+        narrowest = rows[raw[rows].argmin()]
+        middles = [np.flatnonzero(curve < curve.min() + CLOSED_MM).mean() for curve in (raw[rows], gap[rows])]
+        near = gap[max(narrowest - 1, 0) : narrowest + 2].min()
+        found.append((float(near), abs(float(middles[1] - middles[0]))))
+    return found
+
+
+def plosive_starts(words: Path) -> list[float]:
+    """Starts in s of the words that begin with b, p or m."""
+    listed = json.loads(words.read_text(encoding="utf-8"))["words"]
+    return [float(entry["start"]) for entry in listed if entry["word"].lower().startswith(PLOSIVES)]
+
+
+def report(folder: Path) -> list[str]:
+    """The lines of one run."""
+    run = RunFolder.open(folder)
+    landmarks = files.read_landmarks(folder / "landmarks/landmarks.npz")
+    segment = files.read_frames(folder / "ingest/frames.npz").segment
+    fits = {name: files.read_track(folder / name / "track.npz") for name in ("track", "refine")}
+    raw, refined = raw_openings(landmarks), fits["refine"]
+    seen = refined.valid & np.isfinite(raw)
+    gap = refined.lip_gap_mm.astype(np.float64)
+    shut = gap[seen & (raw <= np.quantile(raw[seen], 0.1))]
+    agreement = [_agreement(fit, raw, seen) for fit in fits.values()]
+    lines = [
+        f"{folder.stem}: used {refined.valid.sum()} of {len(raw)}",
+        "  r {:.3f}, {:.3f}   slope {:.2f}, {:.2f}".format(*np.transpose(agreement).ravel()),
+        "  shut {:.2f}   95 % {:.2f}   largest {:.2f}".format(*np.quantile(shut, (0.5, 0.95, 1.0))),
+    ]
+    if cuts := np.count_nonzero(np.diff(segment)):
+        residual = refined.reprojection_px.astype(np.float64)
+        lines.append("  cuts {}: {:.2f}, {:.2f}".format(cuts, *after_cuts(residual, refined.valid, segment)))
+    words = run.video.with_suffix(".words.json")
+    if words.is_file():
+        found = closures(raw, gap, refined.time, seen, plosive_starts(words))
+        near, apart = np.transpose(found)
+        median, most = np.quantile(near, (0.5, 0.9))
+        lines.append(
+            f"  plosives {(near < CLOSED_MM).sum()} of {len(near)} closed   middles {(apart <= 1).sum()}"
+            f"   narrowest {median:.2f}, 90 % {most:.2f}"
+        )
+    return lines
+
+
+def _agreement(fit: Track, raw: F64, seen: Bool) -> tuple[float, float]:
+    """Correlation with the raw openings, and slope upon them."""
+    gap = fit.lip_gap_mm[seen]
+    return float(np.corrcoef(raw[seen], gap)[0, 1]), float(np.polyfit(raw[seen], gap, 1)[0])
+
+
+def main() -> None:
+    """Print what can be told of each run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    for folder in parser.parse_args().runs:
+        print(*report(folder), sep="\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()
