@@ -5,7 +5,8 @@ first, and wrong in its own way.
 
 used        frames in use
 r, slope    of the lip opening with the raw landmarks', of the landmark fit and refined
-shut        the tenth of the frames whose raw lips are closest: median opening, 95 % and the largest, mm
+shut        the tenth of the frames whose raw lips are closest: median opening of the landmark fit and refined; of the
+            latter what 95 % stay below, and the largest, mm
 cuts        how many; residual in the second and the third frame after one, by the clip's median
 plosives    words that begin with b, p or m, by WORDS.json beside the video (`words`: word, start s): how many of them
             have the fitted lips closed within one frame of the narrowest raw ones; for how many the middles of the
@@ -86,12 +87,15 @@ def report(folder: Path) -> list[str]:
     raw, refined = raw_openings(landmarks), fits["refine"]
     seen = refined.valid & np.isfinite(raw)
     gap = refined.lip_gap_mm.astype(np.float64)
-    shut = gap[seen & (raw <= np.quantile(raw[seen], 0.1))]
+    shut = seen & (raw <= np.quantile(raw[seen], 0.1))
+    medians = [float(np.median(fit.lip_gap_mm[shut])) for fit in fits.values()]
     agreement = [_agreement(fit, raw, seen) for fit in fits.values()]
     lines = [
         f"{folder.stem}: used {refined.valid.sum()} of {len(raw)}",
         "  r {:.3f}, {:.3f}   slope {:.2f}, {:.2f}".format(*np.transpose(agreement).ravel()),
-        "  shut {:.2f}   95 % {:.2f}   largest {:.2f}".format(*np.quantile(shut, (0.5, 0.95, 1.0))),
+        "  shut {:.2f}, {:.2f}   95 % {:.2f}   largest {:.2f}".format(
+            *medians, *np.quantile(gap[shut], (0.95, 1.0))
+        ),
     ]
     if cuts := np.count_nonzero(np.diff(segment)):
         residual = refined.reprojection_px.astype(np.float64)
