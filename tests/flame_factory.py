@@ -21,7 +21,7 @@ from tracker.head import load_head
 from tracker.landmark_indices import IBUG_51, INNER_LIP_LOWER, INNER_LIP_UPPER, LEFT_EYE, LIPS, RIGHT_EYE
 
 IDENTITIES, EXPRESSIONS = 300, 100
-ARKIT = 52  # shapes of the embedded head, of its 54
+ARKIT = 52  # shapes of the embedded head, whose others are the lips' profile's
 NOSE_BROWS = (168, 6, 197, 195, 5, 4, 1, 2, 98, 327, 70, 63, 105, 66, 107, 336, 296, 334, 293, 300)
 EMBEDDED = tuple(
     dict.fromkeys((*NOSE_BROWS, *LEFT_EYE, *RIGHT_EYE, *LIPS, *INNER_LIP_UPPER, *INNER_LIP_LOWER))

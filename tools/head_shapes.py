@@ -38,7 +38,7 @@ SEALED = (
     "mouthRight", "cheekPuff",
 )  # fmt: skip
 
-# The lips' own shapes: how far apart at weight 1, and how far from the lips' edges the skin follows, m.
+# The lips' own shapes: displacement at weight 1, and how far from the lips' edges the skin follows, m.
 LIP_SHAPE, LIP_REACH = 0.005, 0.008
 
 
@@ -285,7 +285,7 @@ def _blink(blink: F64, template: F64, mesh: Mesh, lids: Seam) -> F64:
 
 
 def lip_profiles(mesh: Mesh, template: F64, lips: Seam) -> tuple[list[str], F64]:
-    """Names and shapes [2, D, 3] m: the lips apart by a whole wave, and by one and a half, from corner to corner.
+    """Names and shapes [4, D, 3] m: each lip up by a whole wave, and by one and a half, from corner to corner.
 
     ARKit's shapes open every mouth with one profile. Half a wave is what they do: it would take their place.
     """
@@ -293,11 +293,11 @@ def lip_profiles(mesh: Mesh, template: F64, lips: Seam) -> tuple[list[str], F64]
     length = np.linalg.norm(template[sides[:, 0]] - template[sides[:, 1]], axis=1)
     graph = csr_array((length, sides.T), (mesh.count, mesh.count))
     edges = lips.upper[1:-1], lips.lower[1:-1]
-    upper, lower = (dijkstra(graph, directed=False, indices=edge, min_only=True) for edge in edges)
-    follow = np.exp(-((np.minimum(upper, lower) / LIP_REACH) ** 2)) * np.where(lower > upper, 1, -1)
+    far = np.stack([dijkstra(graph, directed=False, indices=edge, min_only=True) for edge in edges])
     right, left = template[lips.upper[[0, -1]], 0]
     along = np.clip((template[:, 0] - right) / (left - right), 0, 1)
+    waves = np.stack([np.sin(count * np.pi * along) for count in (2, 3)])
+    follow = np.exp(-((far / LIP_REACH) ** 2)) * (far < far[::-1])
     shapes = np.zeros((len(LIP_SHAPES), mesh.count, 3))
-    for shape, waves in zip(shapes, (2, 3)):
-        shape[:, 1] = LIP_SHAPE / 2 * follow * np.sin(waves * np.pi * along)
+    shapes[..., 1] = LIP_SHAPE * (follow[:, None] * waves).reshape(len(LIP_SHAPES), -1)
     return list(LIP_SHAPES), shapes

@@ -1,7 +1,7 @@
 """A head's movements as the fit solves them: linear modes with bounds and priors, and what they mean to the head.
 
-An embedded head gives its ARKit shapes, 0..1, and two of the lips' profile, -1..1. A head of signed shapes gives those,
-with a Gaussian prior, and its jaw: opening and side turn, each as the displacement at a turn of JAW_STEP. That chord
+An embedded head gives its ARKit shapes, 0..1, and four of the lips' profile, -1..1. A head of signed shapes gives
+those, with a Gaussian prior, and its jaw: opening and side turn, each as the displacement at a turn of JAW_STEP. That chord
 differs from the arc, at the chin, by 0.6 mm at a jaw angle of 0.25 rad and 2.6 mm at 0.35 rad, mostly in depth; the fit
 keeps one solver for all heads.
 """
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 JAW_STEP, WIDEST_JAW = 0.2, 0.7  # rad
 # Shapes that trade depth or side shift against pose, or that landmarks cannot see.
-# The lips apart by two and three half waves from corner to corner, 5 mm at weight 1.
-LIP_SHAPES = ("lipsApart2", "lipsApart3")
+# A lip up by two or three half waves from corner to corner, 5 mm at weight 1.
+LIP_SHAPES = ("lipUpper2", "lipUpper3", "lipLower2", "lipLower3")
 AMBIGUOUS = ("jawForward", "jawLeft", "jawRight", "mouthLeft", "mouthRight", "tongueOut", "cheekPuff")
 
 
