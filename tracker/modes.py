@@ -1,9 +1,9 @@
 """A head's movements as the fit solves them: linear modes with bounds and priors, and what they mean to the head.
 
 An embedded head gives its ARKit shapes, 0..1, and four of the lips' profile, -1..1. A head of signed shapes gives
-those, with a Gaussian prior, and its jaw: opening and side turn, each as the displacement at a turn of JAW_STEP. That chord
-differs from the arc, at the chin, by 0.6 mm at a jaw angle of 0.25 rad and 2.6 mm at 0.35 rad, mostly in depth; the fit
-keeps one solver for all heads.
+those, with a Gaussian prior, and its jaw: opening and side turn, each as the displacement at a turn of JAW_STEP. That
+chord differs from the arc, at the chin, by 0.6 mm at a jaw angle of 0.25 rad and 2.6 mm at 0.35 rad, mostly in depth;
+the fit keeps one solver for all heads.
 """
 
 from __future__ import annotations
