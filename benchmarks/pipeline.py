@@ -14,22 +14,16 @@ import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
-
+from benchmarks.real_tracks import agreement, raw_openings
 from personalize.pipeline import STAGES
 from personalize.run import RunFolder, read_landmarks, read_track
-from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 
 
 def lip_opening_r(run: Path) -> float:
     """Correlation of `lip_gap_mm` with the landmarks' own opening, over the tracked frames."""
-    track, points = (
-        read_track(run / "refine/track.npz"),
-        read_landmarks(run / "landmarks/landmarks.npz").points,
-    )
-    opening = np.linalg.norm(points[:, 13, :2] - points[:, 14, :2], axis=1)
-    eyes = np.linalg.norm(points[:, LEFT_EYE_OUTER, :2] - points[:, RIGHT_EYE_OUTER, :2], axis=1)
-    return float(np.corrcoef(track.lip_gap_mm[track.valid], (opening / eyes)[track.valid])[0, 1])
+    track = read_track(run / "refine/track.npz")
+    raw = raw_openings(read_landmarks(run / "landmarks/landmarks.npz"))
+    return agreement(track, raw, track.valid)[0]
 
 
 def main() -> None:

@@ -28,6 +28,7 @@ from personalize.run import RunFolder
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.track import F64, Landmarks, Track
 
+INNER_LIPS = (13, 14)  # upper and lower, in the middle
 EYES_MM = 90.0  # between the outer corners of the eyes, about
 AROUND_S = 0.16  # a word's first sound closes the lips so near to its start
 PLOSIVES = tuple("bpm")
@@ -35,11 +36,26 @@ PLOSIVES = tuple("bpm")
 Bool = NDArray[np.bool_]
 
 
+def eye_distance(landmarks: Landmarks) -> F64:
+    """[T] px between the outer corners of the eyes; NaN without a face."""
+    return _apart(landmarks, LEFT_EYE_OUTER, RIGHT_EYE_OUTER)
+
+
 def raw_openings(landmarks: Landmarks) -> F64:
     """[T] mm between the inner lips' middles, by the distance of the eyes; NaN without a face."""
+    return EYES_MM * _apart(landmarks, *INNER_LIPS) / eye_distance(landmarks)
+
+
+def _apart(landmarks: Landmarks, one: int, other: int) -> F64:
+    """[T] px between two landmarks."""
     points = landmarks.points[..., :2].astype(np.float64)
-    eyes = np.linalg.norm(points[:, LEFT_EYE_OUTER] - points[:, RIGHT_EYE_OUTER], axis=-1)
-    return EYES_MM * np.linalg.norm(points[:, 13] - points[:, 14], axis=-1) / eyes
+    return np.asarray(np.linalg.norm(points[:, one] - points[:, other], axis=-1))
+
+
+def agreement(track: Track, raw: F64, seen: Bool) -> tuple[float, float]:
+    """Correlation of the track's opening with the raw ones [T] mm over the frames seen [T], and slope upon them."""
+    gap = track.lip_gap_mm[seen]
+    return float(np.corrcoef(raw[seen], gap)[0, 1]), float(np.polyfit(raw[seen], gap, 1)[0])
 
 
 def after_cuts(residual: F64, valid: Bool, segment: NDArray[np.int32]) -> tuple[float, float]:
@@ -89,10 +105,10 @@ def report(folder: Path) -> list[str]:
     gap = refined.lip_gap_mm.astype(np.float64)
     shut = seen & (raw <= np.quantile(raw[seen], 0.1))
     medians = [float(np.median(fit.lip_gap_mm[shut])) for fit in fits.values()]
-    agreement = [_agreement(fit, raw, seen) for fit in fits.values()]
+    agreements = [agreement(fit, raw, seen) for fit in fits.values()]
     lines = [
         f"{folder.stem}: used {refined.valid.sum()} of {len(raw)}",
-        "  r {:.3f}, {:.3f}   slope {:.2f}, {:.2f}".format(*np.transpose(agreement).ravel()),
+        "  r {:.3f}, {:.3f}   slope {:.2f}, {:.2f}".format(*np.transpose(agreements).ravel()),
         "  shut {:.2f}, {:.2f}   95 % {:.2f}   largest {:.2f}".format(
             *medians, *np.quantile(gap[shut], (0.95, 1.0))
         ),
@@ -101,8 +117,7 @@ def report(folder: Path) -> list[str]:
         residual = refined.reprojection_px.astype(np.float64)
         lines.append("  cuts {}: {:.2f}, {:.2f}".format(cuts, *after_cuts(residual, refined.valid, segment)))
     words = run.video.with_suffix(".words.json")
-    if words.is_file():
-        found = closures(raw, gap, refined.time, seen, plosive_starts(words))
+    if words.is_file() and (found := closures(raw, gap, refined.time, seen, plosive_starts(words))):
         near, apart = np.transpose(found)
         median, most = np.quantile(near, (0.5, 0.9))
         lines.append(
@@ -110,12 +125,6 @@ def report(folder: Path) -> list[str]:
             f"   narrowest {median:.2f}, 90 % {most:.2f}"
         )
     return lines
-
-
-def _agreement(fit: Track, raw: F64, seen: Bool) -> tuple[float, float]:
-    """Correlation with the raw openings, and slope upon them."""
-    gap = fit.lip_gap_mm[seen]
-    return float(np.corrcoef(raw[seen], gap)[0, 1]), float(np.polyfit(raw[seen], gap, 1)[0])
 
 
 def main() -> None:

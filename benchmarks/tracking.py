@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from benchmarks.films import film
 from benchmarks.ground_truth import GroundTruth
 from benchmarks.in_model import noisy_landmarks
+from benchmarks.real_tracks import agreement, eye_distance, raw_openings
 from benchmarks.rendered_heads import SCENES
 from benchmarks.track_bars import Row, print_bars
 from benchmarks.track_errors import compare
@@ -46,7 +47,6 @@ from tracker.camera import estimate_camera
 from tracker.confidence import bare, judge
 from tracker.fit import fit_track
 from tracker.head import HeadModel, load_head
-from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.landmarker import track_landmarks
 from tracker.occlusion import Appearance, FaceWatch
 from tracker.refine import refine_track
@@ -174,14 +174,12 @@ def wanted(name: str, chosen: set[str]) -> bool:
 def consistency(track: Track, landmarks: Landmarks) -> dict[str, float]:
     """Residual in % of the outer-eye distance, lip opening against the raw landmarks', gap when closed."""
     seen = track.valid
-    points = landmarks.points[seen, :, :2]
-    eyes = np.linalg.norm(points[:, LEFT_EYE_OUTER] - points[:, RIGHT_EYE_OUTER], axis=-1)
-    raw = np.linalg.norm(points[:, 13] - points[:, 14], axis=-1) / eyes
+    raw = raw_openings(landmarks)
     gap = track.lip_gap_mm[seen]
     return {
-        "reprojection_pct": 100 * float((track.reprojection_px[seen] / eyes).mean()),
-        "opening_r": float(np.corrcoef(raw, gap)[0, 1]),
-        "gap_at_closure_mm": float(np.median(gap[raw <= np.quantile(raw, 0.1)])),
+        "reprojection_pct": 100 * float((track.reprojection_px / eye_distance(landmarks))[seen].mean()),
+        "opening_r": agreement(track, raw, seen)[0],
+        "gap_at_closure_mm": float(np.median(gap[raw[seen] <= np.quantile(raw[seen], 0.1)])),
         "gap_p95_mm": float(np.quantile(gap, 0.95)),
         "confidence": float(track.confidence[seen].mean()),
     }

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from tracker.head import HeadModel
 
 JAW_STEP, WIDEST_JAW = 0.2, 0.7  # rad
-# Shapes that trade depth or side shift against pose, or that landmarks cannot see.
 # A lip up by two or three half waves from corner to corner, 5 mm at weight 1.
 LIP_SHAPES = ("lipUpper2", "lipUpper3", "lipLower2", "lipLower3")
+# Shapes that trade depth or side shift against pose, or that landmarks cannot see.
 AMBIGUOUS = ("jawForward", "jawLeft", "jawRight", "mouthLeft", "mouthRight", "tongueOut", "cheekPuff")
 
 
