@@ -1,9 +1,9 @@
 """What can be told of tracks of real clips: `python -m benchmarks real_tracks RUN [RUN ...]`.
 
-The runs must have come as far as `refine`. There is no truth: the landmarks' own opening is what the eye would say
+The runs must have come as far as `judge`. There is no truth: the landmarks' own opening is what the eye would say
 first, and wrong in its own way.
 
-used        frames in use
+used        frames in use, by quality.csv; all below is of these
 r, slope    of the lip opening with the raw landmarks', of the landmark fit and refined
 shut        the tenth of the frames whose raw lips are closest: median opening of the landmark fit and refined; of the
             latter what 95 % stay below, and the largest, mm
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from benchmarks.track_errors import CLOSED_MM
 from personalize import run as files
+from personalize.quality import read_reasons
 from personalize.run import RunFolder
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.track import F64, Landmarks, Track
@@ -101,13 +102,14 @@ def report(folder: Path) -> list[str]:
     segment = files.read_frames(folder / "ingest/frames.npz").segment
     fits = {name: files.read_track(folder / name / "track.npz") for name in ("track", "refine")}
     raw, refined = raw_openings(landmarks), fits["refine"]
-    seen = refined.valid & np.isfinite(raw)
+    used = read_reasons(folder / "refine/quality.csv") == "ok"
+    seen = used & np.isfinite(raw)
     gap = refined.lip_gap_mm.astype(np.float64)
     shut = seen & (raw <= np.quantile(raw[seen], 0.1))
     medians = [float(np.median(fit.lip_gap_mm[shut])) for fit in fits.values()]
     agreements = [agreement(fit, raw, seen) for fit in fits.values()]
     lines = [
-        f"{folder.stem}: used {refined.valid.sum()} of {len(raw)}",
+        f"{folder.stem}: used {used.sum()} of {len(raw)}",
         "  r {:.3f}, {:.3f}   slope {:.2f}, {:.2f}".format(*np.transpose(agreements).ravel()),
         "  shut {:.2f}, {:.2f}   95 % {:.2f}   largest {:.2f}".format(
             *medians, *np.quantile(gap[shut], (0.95, 1.0))
@@ -115,7 +117,7 @@ def report(folder: Path) -> list[str]:
     ]
     if cuts := np.count_nonzero(np.diff(segment)):
         residual = refined.reprojection_px.astype(np.float64)
-        lines.append("  cuts {}: {:.2f}, {:.2f}".format(cuts, *after_cuts(residual, refined.valid, segment)))
+        lines.append("  cuts {}: {:.2f}, {:.2f}".format(cuts, *after_cuts(residual, used, segment)))
     words = run.video.with_suffix(".words.json")
     if words.is_file() and (found := closures(raw, gap, refined.time, seen, plosive_starts(words))):
         near, apart = np.transpose(found)
