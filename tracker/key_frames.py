@@ -14,6 +14,10 @@ from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.track import F64
 
 KEY_FRAMES = 48
+FEW, APART = (
+    16,
+    3,
+)  # of a short clip at least, and no more than one of so many frames: neighbours show the same
 REST_SHARE = 0.5  # of the key frames: frames at rest, which tell the neutral face
 
 Frames = NDArray[np.int64]
@@ -22,7 +26,7 @@ Frames = NDArray[np.int64]
 def key_frames(observed: F64, px_per_m: F64, count: int = KEY_FRAMES) -> tuple[Frames, Frames]:
     """Frames at rest (mouth closed, little motion) spread over poses, and others, over poses and expressions.
 
-    `count` at most, REST_SHARE of them at rest. observed: [n, 478, 2] px.
+    `count` at most, fewer of a short clip, REST_SHARE of them at rest. observed: [n, 478, 2] px.
     """
     n = len(observed)
     opening = np.linalg.norm(observed[:, 13] - observed[:, 14], axis=-1) / px_per_m
@@ -31,7 +35,7 @@ def key_frames(observed: F64, px_per_m: F64, count: int = KEY_FRAMES) -> tuple[F
     speed[1:] = np.linalg.norm(np.diff(lips, axis=0), axis=-1).max(1)
     quiet = np.sort(np.argsort(opening + speed, kind="stable")[: max(1, n // 5)])
     pose, features = _looks(observed, px_per_m)
-    count = min(n, count)
+    count = min(n, count, max(FEW, n // APART))
     usual = np.linalg.norm(pose[quiet] - np.median(pose[quiet], axis=0), axis=1).argmin()
     rest = farthest(pose, quiet[[usual]], quiet, max(1, int(count * REST_SHARE)))
     return np.sort(rest), np.sort(farthest(features, rest, np.arange(n), count)[len(rest) :])

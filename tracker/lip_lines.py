@@ -9,7 +9,7 @@ import numpy as np
 
 from tracker.energy import LIP_PAIRS, rotation_matrix
 from tracker.track import F64
-from tracker.view import U8, Index
+from tracker.view import U8
 
 # Outer edges of the upper and the lower lip above and below each pair of the inner ones.
 OUTER_PAIRS = (
@@ -18,6 +18,8 @@ OUTER_PAIRS = (
 )
 STEP_MM, REACH_MM = 0.4, 13.0  # of the samples along a line, to both sides of the inner lips' middle
 SAMPLES = np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM)
+# Of a grey level: light becomes a sum. Where it is dark, colours are noise.
+LOG = np.log(np.arange(256, dtype=np.float32) + np.float32(8.0))
 BLUR = 0.6  # standard deviation in steps, and no less than LEAST_BLUR_PX
 LEAST_BLUR_PX = 0.5
 
@@ -58,12 +60,17 @@ class LipLines:
         x, y = np.moveaxis((places - low).astype(np.float32), 2, 0)
         return cv2.remap(mouth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
-    def opened(self, observed: F64, rows: Index, widths: F64) -> F64:
-        """The landmarks [n, 478, 2] px with the inner lips of frames `rows` [m] moved `widths` [m, Q] mm apart."""
-        out = observed.copy()
-        more = (widths - (self.marks[rows, :, 2] - self.marks[rows, :, 1])) / 2
-        move = more[..., None] * self.step[rows, None]
+    def widths(self, observed: F64) -> F64:
+        """[n, Q] mm, how far apart landmarks [n, 478, 2] px have the inner lips."""
         upper, lower = np.transpose(LIP_PAIRS)
-        out[rows[:, None], upper] -= move
-        out[rows[:, None], lower] += move
+        apart = observed[:, lower] - observed[:, upper]
+        return np.einsum("nqx,nx->nq", apart, self.step) / (self.step**2).sum(1, keepdims=True)
+
+    def opened(self, observed: F64, widths: F64) -> F64:
+        """The landmarks [n, 478, 2] px with the inner lips moved `widths` [n, Q] mm apart."""
+        out = observed.copy()
+        move = ((widths - self.widths(observed)) / 2)[..., None] * self.step[:, None]
+        upper, lower = np.transpose(LIP_PAIRS)
+        out[:, upper] -= move
+        out[:, lower] += move
         return out

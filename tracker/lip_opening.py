@@ -14,11 +14,10 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from tracker.lip_lines import SAMPLES, STEP_MM
+from tracker.lip_lines import LOG, SAMPLES, STEP_MM
 from tracker.track import F32, F64
 from tracker.view import U8, Index
 
-DARK = 8.0  # grey levels added before the logarithm: below, colours are noise
 BINS = 20  # of each of three axes of colour
 LEAST_RANGE = 0.1  # of log colour along an axis: below, it is noise
 RARE = 0.01  # share of colours that have never been seen in a class
@@ -41,8 +40,8 @@ DARKNESS = 0.33  # of the lip's light: what has less is dark
 LIT_REACH_MM = 1.2  # from the colours' edge
 
 
-def lip_widths(colours: U8, marks: F64, sound: Index) -> F64 | None:
-    """[n, Q] mm between the lips, of colours [n, Q, S, 3] u8 along lines with the landmarks' marks [n, Q, 4].
+def lip_edges(colours: U8, marks: F64, sound: Index) -> F64 | None:
+    """[n, Q, 2] mm, the lips' inner edges, of colours [n, Q, S, 3] u8 along lines with the landmarks' marks [n, Q, 4].
 
     The landmarker sees a whole mouth too high or too low: what the edges found in the colours tell of that is taken out
     of the marks before they teach the colours again. sound: rows whose colours are the face's own. None where they do
@@ -61,8 +60,7 @@ def lip_widths(colours: U8, marks: F64, sound: Index) -> F64 | None:
     if (known := LipColours.of(taught, moved[learned])) is None:
         return None
     parts = np.array_split(np.arange(len(colours)), max(1, len(colours) // LEARNED))
-    edges = np.concatenate([known.edges(colours[rows], moved[rows]) for rows in parts])
-    return np.maximum(edges[..., 1] - edges[..., 0], 0.0)
+    return np.concatenate([known.edges(colours[rows], moved[rows]) for rows in parts])
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ def _down(edges: F64, marks: F64) -> float:
 
 def _colour_axes(colours: U8, marks: F64) -> F32:
     """[n, Q, S, 3] brightness, red and blue against green, as logarithms relative to the frame's lips."""
-    log = np.log(np.arange(256, dtype=np.float32) + np.float32(DARK))[colours]
+    log = LOG[colours]
     lips = np.isin(_classes(marks), (UPPER, LOWER))
     count = np.maximum(lips.sum((1, 2)), 1)[:, None]
     log -= (np.einsum("nqsc,nqs->nc", log, lips.astype(np.float32)) / count)[:, None, None]

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from tracker.fit import at_rest, make_track, resume, runs, smoothness_between, trusted, with_lips_shut
 from tracker.key_frames import key_frames
 from tracker.lip_lines import LipLines
-from tracker.lip_opening import lip_widths
+from tracker.lip_motion import steadied
+from tracker.lip_opening import lip_edges
 from tracker.rigid_pose import hold_poses
 from tracker.skin_fit import Photometry, Subject, fit_landmarks, fit_stretch, learn_levels
 from tracker.skin_identity import fit_identity_to_skin
@@ -61,9 +62,9 @@ def refine_track(
     each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
     look like keeps its landmark fit, and so does one whose picture is missing. bundle, evidence: see `fit_track`; poses
     end halfway between what the grey levels and the bundle tell.
-    What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips
-    (tracker/lip_opening.py), depth by how the skin shifts in a turn (tracker/skin_identity.py), pose and jitter by the
-    grey levels of the skin.
+    What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips and by how the
+    lips move (tracker/lip_opening.py, tracker/lip_motion.py), depth by how the skin shifts in a turn
+    (tracker/skin_identity.py), pose and jitter by the grey levels of the skin.
     """
     photometry = photometry or Photometry()
     energy, x, observed, good = resume(track, landmarks, camera, head, evidence)
@@ -79,12 +80,9 @@ def refine_track(
     held, cuts, colours = _looked_at(subject, lines, camera, frames, good, {*usual, *rest, *other})
     if not held:
         return Refined(track, unknown)
-    rows = np.array(list(colours))
-    bare = np.flatnonzero(np.isin(rows, sound))
-    widths = lip_widths(np.stack(list(colours.values())), lines.marks[rows], bare)
-    if widths is not None:
-        observed = lines.opened(observed, rows, widths)
-        subject = _with_landmarks(subject, observed, x, sound)
+    widths = _read_widths(lines, colours, runs(good, segment), sound)
+    opened = lines.opened(observed, lines.widths(_fitted(subject, observed, x)) if widths is None else widths)
+    subject = _with_landmarks(subject, opened, x, sound)
     identity = fit_identity_to_skin(subject, held, (rest, other), x)
     if widths is not None or (identity != track.identity).any():
         subject = subject.with_identity(identity)
@@ -110,8 +108,31 @@ def refine_track(
             progress(min(start + STRETCH, len(good)), len(good))
     if camera.method != "prior":
         refined = hold_poses(refined, bundle, good, runs(good, segment), sound, HALFWAY)
-    out = make_track(landmarks, camera, head, subject.energy, observed, identity, refined, good)
+    out = make_track(landmarks, camera, head, subject.energy, opened, identity, refined, good)
     return Refined(out, _relative(deviation, good, len(track.time)))
+
+
+def _read_widths(lines: LipLines, colours: dict[int, U8], run: Index, sound: Index) -> F64 | None:
+    """[n, Q] mm between the lips, of the colours along the lines by rows; None where they do not tell it.
+
+    Rows without colours keep the landmarks' widths. run: [n], see `runs`. sound: rows that are believed.
+    """
+    rows, along = np.array(list(colours)), np.stack(list(colours.values()))
+    bare = np.isin(rows, sound)
+    edges = lip_edges(along, lines.marks[rows], np.flatnonzero(bare))
+    if edges is None:
+        return None
+    widths = lines.marks[..., 2] - lines.marks[..., 1]
+    widths[rows] = steadied(edges, along, np.where(bare, run[rows], -1))
+    return widths
+
+
+def _fitted(subject: Subject, observed: F64, x: F64) -> F64:
+    """The landmarks [n, 478, 2] px with those that the head has where x [n, U] puts them."""
+    shape = subject.energy.shape(subject.identity.astype(np.float64))
+    out = observed.copy()
+    out[:, subject.energy.model.landmarks] = subject.energy.project(shape, x)
+    return out
 
 
 def _with_landmarks(subject: Subject, observed: F64, x: F64, sound: Index) -> Subject:

@@ -38,13 +38,13 @@ class Photometry:
     """Cauchy scale, in standard deviations of a point's grey level."""
     prior: float = 2.0
     """Factor on the landmark fit's expression prior: more evidence needs more holding of what it cannot tell."""
-    pair_noise_mm: float = 0.07
+    pair_noise_mm: float = 0.04
     """Standard deviation of an opening between landmarks that the colours moved: real lips roll, wet and fold as no
     albedo tells.
 
     At 1 the skin opened lips by 1 to 3 mm on real clips that the eye sees shut, at .2 some by 1.5.
     """
-    pair_noise_share: float = 0.02
+    pair_noise_share: float = 0.01
     """What this grows by with the opening."""
     edge_blurs: float = 1.0
     """Skin nearer to the mouth's inside than so many standard deviations of a blur shows teeth and dark as well."""

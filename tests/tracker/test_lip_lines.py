@@ -30,7 +30,8 @@ def test_lines_beyond_the_picture_read_its_border():
 
 def test_opened_moves_both_lips_alike():
     lines = LipLines.across(face(), np.array([2000.0]), np.zeros((1, 3 + POSE)))
-    opened = lines.opened(face(), np.array([0]), np.full((1, 9), 8.0))
+    opened = lines.opened(face(), np.full((1, 9), 8.0))
+    np.testing.assert_allclose(lines.widths(opened), 8)
     (upper, lower) = np.transpose(LIP_PAIRS)
     np.testing.assert_allclose(opened[0, lower] - opened[0, upper], np.tile([0.0, 16.0], (9, 1)))
     np.testing.assert_allclose(opened[0, lower] + opened[0, upper], face()[0, lower] + face()[0, upper])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tracker.lip_lines import SAMPLES
-from tracker.lip_opening import _lit_edge, lip_widths
+from tracker.lip_opening import _lit_edge, lip_edges
 
 FRAMES, LIP_MM = 80, 7.0
 ALL = np.arange(FRAMES)
@@ -41,6 +41,12 @@ def painted(
 def marked(width: np.ndarray) -> np.ndarray:
     """[n, 9, 4] mm: where landmarks would see the edges of lips that are width [n, 9] apart."""
     return np.stack([-width / 2 - LIP_MM, -width / 2, width / 2, width / 2 + LIP_MM], axis=-1)
+
+
+def lip_widths(colours: np.ndarray, marks: np.ndarray, sound: np.ndarray) -> np.ndarray | None:
+    """[n, 9] mm between the edges."""
+    edges = lip_edges(colours, marks, sound)
+    return None if edges is None else np.maximum(edges[..., 1] - edges[..., 0], 0)
 
 
 @pytest.fixture(scope="module")
