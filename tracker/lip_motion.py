@@ -21,8 +21,8 @@ BESIDE = 25  # samples beside an edge, from the first step on: 10 mm of lip and 
 REACH, FINER = 5, 2  # steps to both sides of what the edges tell, and trials in a step
 NEIGHBOUR = 0.5  # weight of the two lines beside a line in its motion
 STRETCH = 1.1  # of an edge's motion to that of what lies beside it
-# Standard deviations of a width by its edges, as if each frame erred on its own (shut lips err by .1 mm, open ones by .4
-# to .6, some eight frames alike), and of its change from one frame to the next: so much, and a share of it more. On
+# Standard deviations of a width by its edges, as if each frame erred on its own (shut lips err by .1 mm, open ones by
+# .4 to .6, some eight frames alike), and of its change from one frame to the next: so much, and a share of it more. On
 # rendered films the change errs by half of that share, but real lips thicken and roll as they move.
 EDGE_MM, EDGE_SHARE = 0.1, 0.25
 MOVED_MM, MOVED_SHARE = 0.1, 0.2
