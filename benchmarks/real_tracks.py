@@ -7,6 +7,9 @@ used        frames in use, by quality.csv; all below is of these
 r, slope    of the lip opening with the raw landmarks', of the landmark fit and refined
 shut        the tenth of the frames whose raw lips are closest: median opening of the landmark fit and refined; of the
             latter what 95 % stay below, and the largest, mm
+still       rms of the face's vertices in the head frame about straight lines over time, landmark fit and refined, mm,
+            in the second in which the landmarks move least
+back        frames after one out of use until the residual is below 1.5 times the clip's median again, at most
 cuts        how many; residual in the second and the third frame after one, by the clip's median
 plosives    words that begin with b, p or m, by WORDS.json beside the video (`words`: word, start s): how many of them
             have the fitted lips closed within one frame of the narrowest raw ones; for how many the middles of the
@@ -22,10 +25,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.track_errors import CLOSED_MM
+from benchmarks.track_errors import CLOSED_MM, recovery_frames
 from personalize import run as files
 from personalize.quality import read_reasons
 from personalize.run import RunFolder
+from tracker.head import load_head
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.track import F64, Landmarks, Track
 
@@ -33,6 +37,7 @@ INNER_LIPS = (13, 14)  # upper and lower, in the middle
 EYES_MM = 90.0  # between the outer corners of the eyes, about
 AROUND_S = 0.16  # a word's first sound closes the lips so near to its start
 PLOSIVES = tuple("bpm")
+STILL_S = 1.0
 
 Bool = NDArray[np.bool_]
 
@@ -57,6 +62,35 @@ def agreement(track: Track, raw: F64, seen: Bool) -> tuple[float, float]:
     """Correlation of the track's opening with the raw ones [T] mm over the frames seen [T], and slope upon them."""
     gap = track.lip_gap_mm[seen]
     return float(np.corrcoef(raw[seen], gap)[0, 1]), float(np.polyfit(raw[seen], gap, 1)[0])
+
+
+def stillest(points: F64, time: F64, seen: Bool, segment: NDArray[np.int32]) -> slice:
+    """The frames of the second in which points [T, L, 2] move least, all of them seen [T] and in one shot; or none."""
+    count = int(np.searchsorted(time, time[0] + STILL_S, side="right"))
+    whole = [
+        start
+        for start in range(len(time) - count + 1)
+        if seen[start : start + count].all() and segment[start] == segment[start + count - 1]
+    ]
+    if not whole:
+        return slice(0, 0)
+    start = min(whole, key=lambda first: about_lines(points[first : first + count]))
+    return slice(start, start + count)
+
+
+def about_lines(places: F64) -> float:
+    """Rms of the distances of places [n, L, 2 or 3] from the straight lines over time that fit them best."""
+    rows = places.reshape(len(places), -1)
+    line = np.vander(np.arange(len(rows)), 2)
+    rest = rows - line @ np.linalg.lstsq(line, rows, rcond=None)[0]
+    return float(np.sqrt((rest.reshape(places.shape) ** 2).sum(-1).mean()))
+
+
+def shaking(track: Track, frames: slice) -> float:
+    """Rms of the face's vertices in the head frame about straight lines over some frames' time, mm."""
+    head = load_head()
+    vertices = head.vertices(track.identity, track.expression[frames], jaw=track.jaw[frames])
+    return 1e3 * about_lines(vertices[:, head.regions["face"]].astype(np.float64))
 
 
 def after_cuts(residual: F64, valid: Bool, segment: NDArray[np.int32]) -> tuple[float, float]:
@@ -115,6 +149,12 @@ def report(folder: Path) -> list[str]:
             *medians, *np.quantile(gap[shut], (0.95, 1.0))
         ),
     ]
+    points = landmarks.points[..., :2] / eye_distance(landmarks)[:, None, None]
+    if (calm := stillest(points, refined.time, seen, segment)).stop:
+        lines.append("  still {:.3f}, {:.3f}".format(*(shaking(fit, calm) for fit in fits.values())))
+    error = np.where(refined.valid, refined.reprojection_px, np.inf).astype(np.float64)
+    if np.isfinite(back := recovery_frames(error, ~used)):
+        lines.append(f"  back {back:.0f}")
     if cuts := np.count_nonzero(np.diff(segment)):
         residual = refined.reprojection_px.astype(np.float64)
         lines.append("  cuts {}: {:.2f}, {:.2f}".format(cuts, *after_cuts(residual, used, segment)))

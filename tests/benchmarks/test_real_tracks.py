@@ -6,7 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.real_tracks import after_cuts, closures, plosive_starts, raw_openings
+from benchmarks.real_tracks import (
+    about_lines,
+    after_cuts,
+    closures,
+    plosive_starts,
+    raw_openings,
+    stillest,
+)
 from tracker.landmark_indices import LEFT_EYE_OUTER, POINTS, RIGHT_EYE_OUTER
 from tracker.track import Landmarks
 
@@ -56,3 +63,24 @@ def test_plosives_are_words_that_begin_with_closed_lips(tmp_path: Path) -> None:
     words = [{"word": word, "start": k} for k, word in enumerate(("bin", "red", "Place", "at", "m", "now"))]
     (tmp_path / "a.words.json").write_text(json.dumps({"words": words}))
     assert plosive_starts(tmp_path / "a.words.json") == [0.0, 2.0, 4.0]
+
+
+def test_what_moves_evenly_does_not_shake() -> None:
+    even = np.arange(26.0)[:, None, None] * np.array([[1.0, -2.0, 0.5], [0.0, 3.0, 1.0]])
+    assert about_lines(even) == pytest.approx(0, abs=1e-9)
+    shaken = even.copy()
+    shaken[:, 0, 1] += np.cos(2 * np.pi * np.arange(26) / 2)  # every frame the other way, by 1
+    assert about_lines(shaken) == pytest.approx(np.sqrt(0.5), rel=0.01)
+
+
+def test_the_stillest_second_is_found_within_one_shot_and_in_use() -> None:
+    shake = np.ones(100)
+    shake[10:36], shake[40:70] = 0.1, 0.3
+    points = np.random.default_rng(0).normal(size=(100, 50, 2)) * shake[:, None, None]
+    one_shot = np.zeros(100, np.int32)
+    assert stillest(points, TIME, EVERYWHERE, one_shot) == slice(10, 36)
+    cut = np.where(np.arange(100) < 20, 0, 1).astype(np.int32)
+    found = stillest(points, TIME, EVERYWHERE, cut)
+    assert found.start >= 40 and found.stop <= 70
+    unused = np.arange(100) % 20 > 0
+    assert stillest(points, TIME, unused, one_shot) == slice(0, 0)
