@@ -139,7 +139,8 @@ def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
     """The energy whose inner-lip landmarks are, on shut lips, as far apart as in the frames at rest that are most shut.
 
     The landmarker keeps the lips of a shut mouth apart, on each face by its own amount; what exceeds LIP_BIAS is taken
-    for an open mouth. x: [n, P], of which the rotations are read.
+    for an open mouth, and frames in which the lips are farther apart tell nothing of it, unless all are. x: [n, P], of
+    which the rotations are read.
     """
     model = energy.model
     named = model.landmarks[model.pairs]
@@ -148,8 +149,10 @@ def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
     up = rotation_matrix(x[rest, -6:-3])[:, :2, 1] * energy.px_per_m[rest, None]
     apart = energy.observed[rest][:, upper] - energy.observed[rest][:, lower]
     height = np.einsum("nqi,ni->nq", apart, up) / (up**2).sum(1, keepdims=True)
+    height -= model.touch[lips]
     shut = np.argsort(height.mean(1), kind="stable")[: max(1, len(rest) // 2)]
-    bias = np.clip(np.median(height[shut], axis=0) - model.touch[lips], -LIP_BIAS, LIP_BIAS)
+    touching = shut[height[shut].mean(1) <= LIP_BIAS]
+    bias = np.clip(np.median(height[touching if len(touching) else shut], axis=0), -LIP_BIAS, LIP_BIAS)
     mean, touch = model.mean.copy(), model.touch.copy()
     mean[upper, 1] += bias / 2
     mean[lower, 1] -= bias / 2
