@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from tracker.energy import landmark_model
 from tracker.fit import at_rest, make_track, resume, runs, smoothness_between, trusted, with_lips_shut
 from tracker.key_frames import key_frames
 from tracker.lip_lines import LipLines
@@ -140,7 +141,10 @@ def _with_landmarks(subject: Subject, observed: F64, x: F64, sound: Index) -> Su
 
     x: [n, U], of which the rotations are read.
     """
-    energy = replace(subject.energy, observed=observed[:, subject.energy.model.landmarks])
+    model = landmark_model(
+        subject.head, subject.energy.weights
+    )  # of shut lips as they are, not as landmarks see them
+    energy = replace(subject.energy, model=model, observed=observed[:, model.landmarks])
     rest = at_rest(observed, energy.px_per_m, sound)
     return replace(subject, energy=with_lips_shut(energy, x, rest))
 
