@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tracker.energy import LIP_PAIRS, Weights, landmark_model
-from tracker.fit import fit_track, resume
+from tracker.fit import fit_track, resume, with_lips_shut
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, INNER_LIP_LOWER, POINTS
 from tracker.modes import LIP_SHAPES
@@ -150,6 +150,21 @@ def test_shut_lips_read_shut_though_the_landmarker_keeps_them_apart():
     assert shut.sum() > 10
     assert np.median(track.lip_gap_mm[shut]) < 0.3
     assert np.sqrt(np.mean((track.lip_gap_mm - talker.gap) ** 2)) < 0.6
+
+
+@pytest.mark.parametrize(("shut", "apart_mm"), [(3, 0.3), (3, 0.8), (0, 1.0)])
+def test_lips_that_hardly_ever_shut_are_not_taken_for_shut(shut: int, apart_mm: float):
+    """Of twenty frames `shut` have lips that touch and are seen apart_mm apart, the others stand open by 2 to 6 mm."""
+    talker = Talker(20, noise=0.0, held=(slice(0, 20), {}))
+    energy, x, *_ = resume(talker.fit(), talker.landmarks, CAMERA, HEAD)
+    model = landmark_model(HEAD, Weights())
+    lips = [k for k, pair in enumerate(model.landmarks[model.pairs].tolist()) if tuple(pair) in LIP_PAIRS]
+    upper, lower = model.pairs[lips].T
+    seen = replace(energy, model=model, observed=energy.observed.copy())
+    down = 1e-3 * np.where(np.arange(20) < shut, apart_mm, np.linspace(2, 6, 20)) * energy.px_per_m
+    seen.observed[:, lower] = seen.observed[:, upper] + np.stack([0 * down, down], axis=-1)[:, None]
+    bias = 1e3 * (with_lips_shut(seen, x, np.arange(20)).model.touch - model.touch)[lips]
+    np.testing.assert_allclose(bias, apart_mm, atol=0.15)
 
 
 def test_shut_lips_are_read_in_bare_frames():

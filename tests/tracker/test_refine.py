@@ -13,9 +13,11 @@ from tracker.energy import LIP_PAIRS
 from tracker.fit import fit_track, make_track, resume
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
+from tracker.lip_lines import LipLines
 from tracker.occlusion import Appearance
 from tracker.raster import render
-from tracker.refine import _stretches, refine_track
+from tracker.refine import _stretches, _with_landmarks, refine_track
+from tracker.skin_fit import Photometry, Subject
 from tracker.track import Bundle, Camera, Landmarks, Track
 
 HEAD = load_head()
@@ -141,6 +143,22 @@ def test_a_dark_mouth_lowers_the_openings_error(dark_mouth: Film):
 def test_pictures_lower_the_openings_error(film: Film):
     error = opening_error_mm(film.refine().track, film.gap)
     assert error < 0.95 * opening_error_mm(film.track, film.gap)
+
+
+def test_what_landmarks_read_of_shut_lips_is_forgotten_when_colours_read_them(film: Film):
+    energy, x, observed, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
+    lines, sound = LipLines.across(observed, energy.px_per_m, x), np.arange(FRAMES)
+    read = lines.opened(observed, np.repeat(film.gap[:, None] + 0.2, len(LIP_PAIRS), axis=1))
+    far = replace(energy, model=replace(energy.model, touch=energy.model.touch + 0.001))
+    near, apart = (
+        _with_landmarks(
+            Subject.of(HEAD, film.track.identity, start, Photometry()), read, x, sound
+        ).energy.model
+        for start in (energy, far)
+    )
+    np.testing.assert_array_equal(near.touch, apart.touch)
+    lips = np.isin(near.landmarks[near.pairs], LIP_PAIRS).all(1)
+    np.testing.assert_allclose(1e3 * near.touch[lips], 0.2, atol=0.1)
 
 
 def test_the_bundles_poses_are_kept_where_it_has_them(film: Film):
