@@ -16,7 +16,7 @@ OUTER_PAIRS = (
     *((185, 146), (40, 91), (39, 181), (37, 84), (0, 17)),
     *((267, 314), (269, 405), (270, 321), (409, 375)),
 )
-STEP_MM, REACH_MM = 0.4, 13.0  # of the samples along a line, to both sides of the inner lips' middle
+STEP_MM, REACH_MM = 0.4, 17.0  # of the samples along a line, to both sides of the inner lips' middle
 SAMPLES = np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM)
 # Of a grey level: light becomes a sum. Where it is dark, colours are noise.
 LOG = np.log(np.arange(256, dtype=np.float32) + np.float32(8.0))

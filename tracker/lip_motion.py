@@ -18,6 +18,8 @@ from tracker.view import U8
 
 APART = (1, 2, 4, 8)  # frames between which motion is looked for: the farther, the less errors add up
 BESIDE = 25  # samples beside an edge, from the first step on: 10 mm of lip and skin
+# Samples of a line that are looked at: 13 mm to both sides of its middle. Nose and chin move on their own.
+FIRST, LAST = (int(np.abs(SAMPLES - end).argmin()) for end in (-13.0, 13.0))
 REACH, FINER = 5, 2  # steps to both sides of what the edges tell, and trials in a step
 NEIGHBOUR = 0.5  # weight of the two lines beside a line in its motion
 STRETCH = 1.1  # of an edge's motion to that of what lies beside it
@@ -123,7 +125,7 @@ def _difference(now, then, edge, shift, side):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=True)
 def _between(line, place, channel):  # type: ignore[no-untyped-def]
-    """A line's colour [S, 3] between two samples; beyond its ends, the last one's."""
-    place = min(max(place, 0.0), len(line) - 1.0)
-    low = min(int(place), len(line) - 2)
+    """A line's colour [S, 3] between two samples; beyond those looked at, the last one's."""
+    place = min(max(place, FIRST), LAST)
+    low = min(int(place), LAST - 1)
     return line[low, channel] + (place - low) * (line[low + 1, channel] - line[low, channel])
