@@ -14,10 +14,8 @@ from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.track import F64
 
 KEY_FRAMES = 48
-FEW, APART = (
-    16,
-    3,
-)  # of a short clip at least, and no more than one of so many frames: neighbours show the same
+# Of a short clip so many at least, and no more than one of so many frames: neighbours show the same.
+FEW, APART = 16, 3
 REST_SHARE = 0.5  # of the key frames: frames at rest, which tell the neutral face
 
 Frames = NDArray[np.int64]

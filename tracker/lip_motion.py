@@ -2,7 +2,7 @@
 
 Colours tell where a lip ends, but err, and for several frames alike: by what lies behind it, by its shade. How far the
 lip and the skin beside it have moved between two frames they tell with another error, and where both are known, widths
-that agree with both err by a quarter less.
+that agree with both err by a fifth less.
 """
 
 from __future__ import annotations

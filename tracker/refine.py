@@ -141,9 +141,8 @@ def _with_landmarks(subject: Subject, observed: F64, x: F64, sound: Index) -> Su
 
     x: [n, U], of which the rotations are read.
     """
-    model = landmark_model(
-        subject.head, subject.energy.weights
-    )  # of shut lips as they are, not as landmarks see them
+    # The head's own, which does not hold what the landmarks had read of shut lips.
+    model = landmark_model(subject.head, subject.energy.weights)
     energy = replace(subject.energy, model=model, observed=observed[:, model.landmarks])
     rest = at_rest(observed, energy.px_per_m, sound)
     return replace(subject, energy=with_lips_shut(energy, x, rest))
