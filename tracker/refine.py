@@ -81,7 +81,7 @@ def refine_track(
     held, cuts, colours = _looked_at(subject, lines, camera, frames, good, {*usual, *rest, *other})
     if not held:
         return Refined(track, unknown)
-    widths = _read_widths(lines, colours, runs(good, segment), sound)
+    widths = _read_widths(lines, colours, good, segment, sound)
     opened = lines.opened(observed, lines.widths(_fitted(subject, observed, x)) if widths is None else widths)
     subject = _with_landmarks(subject, opened, x, sound)
     identity = fit_identity_to_skin(subject, held, (rest, other), x)
@@ -113,10 +113,13 @@ def refine_track(
     return Refined(out, _relative(deviation, good, len(track.time)))
 
 
-def _read_widths(lines: LipLines, colours: dict[int, U8], run: Index, sound: Index) -> F64 | None:
+def _read_widths(
+    lines: LipLines, colours: dict[int, U8], good: Index, segment: NDArray[np.int32], sound: Index
+) -> F64 | None:
     """[n, Q] mm between the lips, of the colours along the lines by rows; None where they do not tell it.
 
-    Rows without colours keep the landmarks' widths. run: [n], see `runs`. sound: rows that are believed.
+    Rows without colours keep the landmarks' widths, and lips are not followed across them. good: [n], the rows' frames.
+    segment: [T], number of the uninterrupted shot. sound: rows that are believed.
     """
     rows, along = np.array(list(colours)), np.stack(list(colours.values()))
     bare = np.isin(rows, sound)
@@ -124,7 +127,7 @@ def _read_widths(lines: LipLines, colours: dict[int, U8], run: Index, sound: Ind
     if edges is None:
         return None
     widths = lines.marks[..., 2] - lines.marks[..., 1]
-    widths[rows] = steadied(edges, along, np.where(bare, run[rows], -1))
+    widths[rows] = steadied(edges, along, np.where(bare, runs(good[rows], segment), -1))
     return widths
 
 

@@ -16,7 +16,7 @@ from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
 from tracker.lip_lines import LipLines
 from tracker.occlusion import Appearance
 from tracker.raster import render
-from tracker.refine import _stretches, _with_landmarks, refine_track
+from tracker.refine import _read_widths, _stretches, _with_landmarks, refine_track
 from tracker.skin_fit import Photometry, Subject
 from tracker.track import Bundle, Camera, Landmarks, Track
 
@@ -159,6 +159,22 @@ def test_what_landmarks_read_of_shut_lips_is_forgotten_when_colours_read_them(fi
     np.testing.assert_array_equal(near.touch, apart.touch)
     lips = np.isin(near.landmarks[near.pairs], LIP_PAIRS).all(1)
     np.testing.assert_allclose(1e3 * near.touch[lips], 0.2, atol=0.1)
+
+
+def test_lips_are_not_followed_across_pictures_that_are_missing(film: Film, monkeypatch: pytest.MonkeyPatch):
+    energy, x, observed, good = resume(film.track, film.landmarks, CAMERA, HEAD)
+    lines = LipLines.across(observed, energy.px_per_m, x)
+    colours = {row: lines.read(film.pictures[row], row) for row in range(FRAMES) if row not in (8, 9)}
+    told: list[np.ndarray] = []
+    monkeypatch.setattr(refine, "lip_edges", lambda along, marks, sound: marks[..., 1:3])
+    monkeypatch.setattr(
+        refine, "steadied", lambda edges, along, run: told.append(run) or np.ones((len(run), 9))
+    )
+    widths = _read_widths(lines, colours, good, np.zeros(FRAMES, np.int32), np.arange(1, FRAMES))
+    assert widths is not None
+    np.testing.assert_array_equal(told[0], [-1, *[0] * 7, *[1] * (FRAMES - 10)])
+    np.testing.assert_allclose(widths[[8, 9]], lines.widths(observed)[[8, 9]])
+    assert (np.delete(widths, (8, 9), axis=0) == 1).all()
 
 
 def test_the_bundles_poses_are_kept_where_it_has_them(film: Film):
