@@ -11,6 +11,8 @@ still       rms of the face's vertices in the head frame about straight lines ov
             in the second in which the landmarks move least
 back        frames after one out of use until the residual is below 1.5 times the clip's median again, at most
 cuts        how many; residual in the second and the third frame after one, by the clip's median
+beside      how far the re-rendered eyes, nose and mouth lie beside the picture's: median, 99 % and largest, mm, and when;
+            in how many frames one of them is not found (`benchmarks/beside.py`)
 plosives    words that begin with b, p or m, by WORDS.json beside the video (`words`: word, start s): how many of them
             have the fitted lips closed within one frame of the narrowest raw ones; for how many the middles of the
             closures, raw and fitted, differ by one frame at most; the narrowest fitted opening, median and 90 %, mm
@@ -25,6 +27,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.beside import PARTS, shifts
 from benchmarks.track_errors import CLOSED_MM, recovery_frames
 from personalize import run as files
 from personalize.quality import read_reasons
@@ -123,6 +126,19 @@ def closures(raw: F64, gap: F64, time: F64, valid: Bool, starts: list[float]) ->
     return found
 
 
+def mesh_on_picture(beside: F64, time: F64, used: Bool) -> list[str]:
+    """How far the PARTS [T, 4] mm of the mesh lie beside the picture's in the frames used [T], in words."""
+    lines = []
+    for part, apart in zip(PARTS, beside.T):
+        if np.isfinite(apart).any():
+            median, most, largest = np.nanquantile(apart[used], (0.5, 0.99, 1.0))
+            told = f"{median:.2f}, 99 % {most:.2f}   largest {largest:.2f} at {time[np.nanargmax(apart)]:.2f} s"
+        else:
+            told = "not told"
+        lines.append(f"beside {part} {told}   not found {np.isnan(apart[used]).sum()}")
+    return lines
+
+
 def plosive_starts(words: Path) -> list[float]:
     """Starts in s of the words that begin with b, p or m."""
     listed = json.loads(words.read_text(encoding="utf-8"))["words"]
@@ -158,6 +174,7 @@ def report(folder: Path) -> list[str]:
     if cuts := np.count_nonzero(np.diff(segment)):
         residual = refined.reprojection_px.astype(np.float64)
         lines.append("  cuts {}: {:.2f}, {:.2f}".format(cuts, *after_cuts(residual, used, segment)))
+    lines += [f"  {line}" for line in mesh_on_picture(shifts(run, load_head(), used), refined.time, used)]
     words = run.video.with_suffix(".words.json")
     if words.is_file() and (found := closures(raw, gap, refined.time, seen, plosive_starts(words))):
         near, apart = np.transpose(found)

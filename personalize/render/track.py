@@ -16,7 +16,7 @@ from tracker.albedo import Albedo, learn_albedo
 from tracker.head import HeadModel
 from tracker.overlay import NEEDS_ALBEDO, draw_modes, letter
 from tracker.raster import project
-from tracker.scene import Crop, place, scene
+from tracker.scene import Crop, Scene, place, scene
 from tracker.track import Landmarks, Track
 
 PANEL = 640  # px, the longer side of each picture in the film
@@ -88,18 +88,23 @@ class TrackPictures:
         return np.concatenate([grid(panels, self.columns), self._footer(frame)])
 
     def tile(self, rgb: U8, frame: int) -> U8:
-        """A square around the face of a tracked frame in the first mode: on it a wrong mesh can be seen."""
-        rgb = self.track.lens.picture(rgb)
-        points = project(place(self.track, frame, self.head)[1], self.track.focal, self.track.principal)
-        low, high = points.min(0), points.max(0)
-        side = round(float((high - low).max()) * (1 + 2 * TILE_MARGIN))
-        x, y = np.round((low + high - side) / 2).astype(int).tolist()
-        tile = self._drawn(rgb, frame, Crop((x, y), (side, side), (TILE, TILE)), self.modes[:1])[0]
+        """The scene of a tracked frame in the first mode: on it a wrong mesh can be seen."""
+        seen = self.scene(rgb, frame)
+        (tile,) = draw_modes(seen, self.modes[:1], self.head, self.albedo)
         text, colour = self._verdict(frame)
         letter(tile, f"{self.track.time[frame]:.2f} s", (LETTERS, 2 * LETTERS), LETTERS)
         letter(tile, text, (LETTERS, 4 * LETTERS), LETTERS, colour)
         cv2.rectangle(tile, (0, 0), (TILE - 1, TILE - 1), colour, 3)
         return tile
+
+    def scene(self, rgb: U8, frame: int) -> Scene:
+        """A square of TILE px around the face of a tracked frame."""
+        points = project(place(self.track, frame, self.head)[1], self.track.focal, self.track.principal)
+        low, high = points.min(0), points.max(0)
+        side = round(float((high - low).max()) * (1 + 2 * TILE_MARGIN))
+        x, y = np.round((low + high - side) / 2).astype(int).tolist()
+        close = Crop((x, y), (side, side), (TILE, TILE))
+        return scene(self.track.lens.picture(rgb), close, self.track, frame, self.landmarks, self.head)
 
     def _drawn(self, rgb: U8, frame: int, crop: Crop, modes: Sequence[str]) -> list[U8]:
         if not self.track.valid[frame]:
