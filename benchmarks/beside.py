@@ -27,7 +27,9 @@ NOSE = 0.6  # of the way from the eyes to the mouth
 RADII_M = {"left eye": 0.022, "right eye": 0.022, "nose": 0.018, "mouth": 0.026}
 BLUR_M = 0.001
 SMALLEST = 10  # px, of a part's sides
-ALIKE = 0.5  # correlation below which the shift means nothing: of six millimetres one part in eight falls below
+ALIKE = (
+    0.5  # correlation below which the shift means nothing: of six millimetres one part in eight falls below
+)
 STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
 
 
@@ -50,11 +52,13 @@ def parts(head: HeadModel, identity: F32) -> list[NDArray[np.int64]]:
     face = head.regions["face"]
 
     def middle(name: str) -> F64:
-        return neutral[np.concatenate([head.regions[f"{name}_{side}"] for side in ("upper", "lower")])].mean(0)
+        rims = np.concatenate([head.regions[f"{name}_{side}"] for side in ("upper", "lower")])
+        return neutral[rims].mean(0)
 
-    eyes, mouth = [middle(name) for name in EYES], middle(MOUTH)
-    nose = (1 - NOSE) * np.mean(eyes, axis=0) + NOSE * mouth
-    places = [*(eye + [0, BROWS_M, 0] for eye in eyes), nose, mouth]
+    (left, right), mouth = (middle(name) for name in EYES), middle(MOUTH)
+    nose = (1 - NOSE) * (left + right) / 2 + NOSE * mouth
+    brows = np.array([0.0, BROWS_M, 0.0])
+    places = (left + brows, right + brows, nose, mouth)
     return [
         face[np.linalg.norm((neutral[face] - place)[:, :2], axis=1) < RADII_M[part]]
         for part, place in zip(PARTS, places)

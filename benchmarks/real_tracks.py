@@ -11,8 +11,8 @@ still       rms of the face's vertices in the head frame about straight lines ov
             in the second in which the landmarks move least
 back        frames after one out of use until the residual is below 1.5 times the clip's median again, at most
 cuts        how many; residual in the second and the third frame after one, by the clip's median
-beside      how far the re-rendered eyes, nose and mouth lie beside the picture's: median, 99 % and largest, mm, and when;
-            in how many frames one of them is not found (`benchmarks/beside.py`)
+beside      how far the re-rendered eyes, nose and mouth lie beside the picture's: median, 99 % and largest, mm, and
+            when; in how many frames it is not found (`benchmarks/beside.py`)
 plosives    words that begin with b, p or m, by WORDS.json beside the video (`words`: word, start s): how many of them
             have the fitted lips closed within one frame of the narrowest raw ones; for how many the middles of the
             closures, raw and fitted, differ by one frame at most; the narrowest fitted opening, median and 90 %, mm
@@ -129,13 +129,13 @@ def closures(raw: F64, gap: F64, time: F64, valid: Bool, starts: list[float]) ->
 def mesh_on_picture(beside: F64, time: F64, used: Bool) -> list[str]:
     """How far the PARTS [T, 4] mm of the mesh lie beside the picture's in the frames used [T], in words."""
     lines = []
-    for part, apart in zip(PARTS, beside.T):
+    for part, apart in zip(PARTS, beside[used].T):
+        told = "not told"
         if np.isfinite(apart).any():
-            median, most, largest = np.nanquantile(apart[used], (0.5, 0.99, 1.0))
-            told = f"{median:.2f}, 99 % {most:.2f}   largest {largest:.2f} at {time[np.nanargmax(apart)]:.2f} s"
-        else:
-            told = "not told"
-        lines.append(f"beside {part} {told}   not found {np.isnan(apart[used]).sum()}")
+            median, most, largest = np.nanquantile(apart, (0.5, 0.99, 1.0))
+            when = time[used][np.nanargmax(apart)]
+            told = f"{median:.2f}, 99 % {most:.2f}   largest {largest:.2f} at {when:.2f} s"
+        lines.append(f"beside {part} {told}   not found {np.isnan(apart).sum()}")
     return lines
 
 

@@ -89,7 +89,7 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 5, ("focal_px", "distortion")
+    name, version, reads = "camera", 6, ("focal_px", "distortion")
     needs = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz")
     makes = ("camera.json", "bundle.npz")
 
@@ -115,7 +115,7 @@ class CameraStage(Stage):
 class TrackStage(Stage):
     """One identity, and expression, pose and gaze in every frame, jointly over the clip."""
 
-    name, version = "track", 7
+    name, version = "track", 8
     needs = (
         *("ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz"),
@@ -143,7 +143,7 @@ class TrackStage(Stage):
 class Refine(Stage):
     """The track again, with the grey levels of the skin."""
 
-    name, folder, version = "refine", "photometric", 14
+    name, folder, version = "refine", "photometric", 15
     needs = (
         *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),

@@ -48,9 +48,9 @@ UPPER_RINGS = (
     (184, 74, 73, 72, 11, 302, 303, 304, 408),
     (185, 40, 39, 37, 0, 267, 269, 270, 409),
 )
-# By so much of the lip's height the upper lip of people is lower than this head's. Of 13 people filmed from the front the
-# outer edge was seen 1.1 mm below the fitted one and the inner edge .8 above, though the identity may thin a lip: of
-# its 10 mm a third would be explained by that. What the identity tells of it is left to it.
+# By so much of its height the upper lip of people is thinner than this head's. Of 13 people filmed from the front the
+# outer edge was seen 1.1 mm below the fitted one and the inner edge .8 above, though the identity may thin a lip: a
+# third of its 10 mm would explain that. Half of it is left to the identity.
 THINNER = 0.2
 OVAL = (10, 338, 297, 332, 284, 251, 397, 365, 379, 378, 400, 377, 152)
 RIGHT_IRIS, LEFT_IRIS = tuple(range(468, 473)), tuple(range(473, 478))
@@ -101,7 +101,8 @@ def carry_back(head: HeadModel, view: View) -> F64:
 def settle(head: HeadModel, places: F64) -> tuple[NDArray[np.int32], F64]:
     """Landmarks kept [L] and their places [L, 3] m on the template: median, symmetric, inner lips on the lip edges.
 
-    places: [views, 478, 3]. The rest of the upper lip lies THINNER nearer to its inner edge than it was seen. A point that half of the views see beside the face is dropped, and so is its twin.
+    places: [views, 478, 3]. The rest of the upper lip lies THINNER nearer to its inner edge than it was seen. A point
+    that half of the views see beside the face is dropped, and so is its twin.
     """
     seen = np.isfinite(places[..., 0]).mean(0)
     median = np.nanmedian(np.where(seen[:, None] > 0, places, 0), axis=0)

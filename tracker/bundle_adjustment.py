@@ -1,7 +1,7 @@
 """Rigid head poses: robust absolute pose per frame, then one bundle adjustment with a shared focal and a shape prior.
 
 The adjustment finds the most probable poses, points and focal length together: Levenberg-Marquardt, in which points
-and then poses are eliminated window by window. A point may lie off the surface (glasses) and a track may fail, so both
+and then poses are eliminated. A point may lie off the surface (glasses) and a track may fail, so both
 count by Cauchy's loss. pycolmap, which gives the absolute poses, puts pixel centres at halves; everything here takes
 and gives them at integers.
 """
@@ -37,8 +37,7 @@ class RigidScene:
     """A rigid head before a moving camera (or the other way round).
 
     frames: [M], numbers of the frames. rotation: [M, 3, 3] and translation: [M, 3] m: head to camera (OpenCV axes).
-    points: [Q, 3] m, head frame. observations: [O, 4] (frame, point, x px, y px). window: [M], frames of different
-    windows share no point.
+    points: [Q, 3] m, head frame. observations: [O, 4] (frame, point, x px, y px).
     """
 
     frames: NDArray[np.int32]
@@ -46,7 +45,16 @@ class RigidScene:
     translation: F64
     points: F64
     observations: F64
-    window: NDArray[np.int32]
+
+    def select(self, frames: NDArray[np.integer]) -> RigidScene:
+        """Some of the frames, and what they see."""
+        return replace(
+            self,
+            frames=self.frames[frames],
+            rotation=self.rotation[frames],
+            translation=self.translation[frames],
+            observations=self.observations[np.isin(self.observations[:, 0], self.frames[frames])],
+        )
 
     def rows(self) -> NDArray[np.int64]:
         """[O] place of each observation's frame among the frames."""
@@ -126,19 +134,6 @@ class _State:
 
 
 @dataclass(frozen=True)
-class _Window:
-    """Frames [m] and points [q] of one window, its observations [o], and sums over a frame's or a point's."""
-
-    frames: NDArray[np.int64]
-    points: NDArray[np.int64]
-    observations: NDArray[np.int64]
-    frame: NDArray[np.int64]
-    point: NDArray[np.int64]
-    by_frame: csr_array
-    by_point: csr_array
-
-
-@dataclass(frozen=True)
 class _Linear:
     """Residuals [O, 2] and their derivatives by pose [O, 2, 6], point [O, 2, 3] and log(focal) [O, 2]; weighted."""
 
@@ -162,7 +157,9 @@ class _Problem:
         length = np.bincount(self._point)
         # The error of a track hardly changes from one frame to the next: tracks count, not observations.
         self._repeats = float((length**2).sum() / length.sum())
-        self._windows = [_window(scene.window, self._row, self._point, n) for n in np.unique(scene.window)]
+        ones, columns = np.ones(len(self._row)), np.arange(len(self._row))
+        self._by_frame = csr_array((ones, (self._row, columns)), shape=(len(scene.frames), len(ones)))
+        self._by_point = csr_array((ones, (self._point, columns)), shape=(len(scene.points), len(ones)))
 
     def let_go(self, loose: float, state: _State) -> None:
         """Allow points to lie `loose` m from the surface at least, and measure the noise."""
@@ -241,99 +238,71 @@ class _Problem:
 
     def _step(self, state: _State, damping: float) -> _State:
         """One step of Levenberg-Marquardt."""
-        normal, slope, solved = self._normal(state, damping)
+        normal, slope, points, poses = self._normal(state, damping)
         common = np.zeros(len(slope))
         common[self._free] = -np.linalg.solve(normal[self._free, self._free], slope[self._free])
-        departure, rotation, translation = (
-            part.copy() for part in (state.departure, state.rotation, state.translation)
-        )
-        for window, (points, poses) in zip(self._windows, solved):
-            change = -(poses[:, -1] + poses[:, :-1] @ common)
-            turn = change.reshape(-1, 6)
-            departure[window.points] -= (points @ [*change, *common, 1.0]).reshape(-1, 3)
-            rotation[window.frames] = Rotation.from_rotvec(turn[:, :3]).as_matrix() @ rotation[window.frames]
-            translation[window.frames] += turn[:, 3:]
+        change = -(poses[:, -1] + poses[:, :-1] @ common)
+        turn = change.reshape(-1, 6)
         longer = float(np.clip(common[0], -LONGEST_STEP, LONGEST_STEP))
-        return _State(state.log_focal + longer, state.shape + common[1:], departure, rotation, translation)
+        return _State(
+            log_focal=state.log_focal + longer,
+            shape=state.shape + common[1:],
+            departure=state.departure - (points @ [*change, *common, 1.0]).reshape(-1, 3),
+            rotation=Rotation.from_rotvec(turn[:, :3]).as_matrix() @ state.rotation,
+            translation=state.translation + turn[:, 3:],
+        )
 
-    def _normal(self, state: _State, damping: float) -> tuple[F64, F64, list[tuple[F64, F64]]]:
-        """Normal matrix and slope of log(focal) and shape, and for each window what gives its points and poses."""
+    def _normal(self, state: _State, damping: float) -> tuple[F64, F64, F64, F64]:
+        """Normal matrix [1 + R, 1 + R] and slope [1 + R] of log(focal) and shape, points and poses solved for.
+
+        Then what gives these back: for points [3Q, 6M + 1 + R + 1] by poses, focal and shape, and 1; for poses
+        [6M, 1 + R + 1] by focal and shape, and 1.
+        """
         linear, off = self._linear(state), 1 / (1 + self._off(state))
         precision = off[:, None, None] * self._precision
         pull = np.einsum("qij,qj->qi", precision, state.departure)
         away = state.log_focal - np.log(self._focal)
-        normal = np.diag([self._focal_precision, *np.ones(len(state.shape))])
-        slope = np.concatenate([[self._focal_precision * away], state.shape])
-        solved = []
-        for window in self._windows:
-            mine = window.points
-            more, pushed, back = _eliminated(
-                linear, window, self._surface.modes[mine], precision[mine], pull[mine], damping
-            )
-            normal, slope = normal + more, slope + pushed
-            solved.append(back)
-        return normal, slope, solved
+        residual, pose, point, focal = linear.residual, linear.pose, linear.point, linear.focal
+        modes = self._surface.modes
+        m, q, r = len(state.rotation), len(modes), modes.shape[2]
+        points = _summed(self._by_point, point.transpose(0, 2, 1) @ point)
+        points_focal = _summed(self._by_point, np.einsum("oki,ok->oi", point, focal)).reshape(-1)
+        points_slope = _summed(self._by_point, np.einsum("oki,ok->oi", point, residual))
+        cells = np.zeros((m, 6, q, 3))
+        cells[self._row, :, self._point] = pose.transpose(0, 2, 1) @ point
+        cross = cells.reshape(6 * m, 3 * q)
+        basis = modes.reshape(3 * q, r)
+        points_shape = (points @ modes).reshape(3 * q, r)
 
+        normal: F64 = np.diag([self._focal_precision, *np.ones(r)])
+        normal[0, 0] += (focal**2).sum()
+        normal[0, 1:] = normal[1:, 0] = points_focal @ basis
+        normal[1:, 1:] += basis.T @ points_shape
+        slope: F64 = np.concatenate(
+            [
+                [self._focal_precision * away + (focal * residual).sum()],
+                state.shape + basis.T @ points_slope.reshape(-1),
+            ]
+        )
+        points_common = np.column_stack([points_focal, points_shape])
+        poses_focal = _summed(self._by_frame, np.einsum("oki,ok->oi", pose, focal)).reshape(-1)
+        poses_common = np.column_stack([poses_focal, cross @ basis])
+        poses_slope = _summed(self._by_frame, np.einsum("oki,ok->oi", pose, residual)).reshape(-1)
+        blocks = np.zeros((m, 6, m, 6))
+        own = _summed(self._by_frame, pose.transpose(0, 2, 1) @ pose)
+        blocks[np.arange(m), :, np.arange(m)] = own * (1 + damping * np.eye(6))
+        poses = blocks.reshape(6 * m, 6 * m)
 
-def _window(
-    windows: NDArray[np.int32], row: NDArray[np.int64], point: NDArray[np.int64], number: int
-) -> _Window:
-    observations = np.flatnonzero(windows[row] == number)
-    frames = np.flatnonzero(windows == number)
-    points, k = np.unique(point[observations], return_inverse=True)
-    m = np.searchsorted(frames, row[observations])
-    ones, columns = np.ones(len(m)), np.arange(len(m))
-    by_frame = csr_array((ones, (m, columns)), shape=(len(frames), len(m)))
-    by_point = csr_array((ones, (k, columns)), shape=(len(points), len(m)))
-    return _Window(frames, points, observations, m, k, by_frame, by_point)
+        right = np.column_stack([cross.T, points_common, (points_slope + pull).reshape(-1)])
+        gone: F64 = np.asarray(np.linalg.inv(points * (1 + damping) + precision), np.float64)
+        back: F64 = (gone @ right.reshape(q, 3, -1)).reshape(3 * q, -1)
+        poses -= cross @ back[:, : 6 * m]
+        rest = np.column_stack([poses_common, poses_slope]) - cross @ back[:, 6 * m :]
+        kept: F64 = np.asarray(np.linalg.solve(poses, rest), np.float64)
+        normal -= points_common.T @ back[:, 6 * m : -1] + rest[:, :-1].T @ kept[:, :-1]
+        slope -= points_common.T @ back[:, -1] + rest[:, :-1].T @ kept[:, -1]
+        return normal, slope, back, kept
 
 
 def _summed(sums: csr_array, values: F64) -> F64:
     return (sums @ values.reshape(len(values), -1)).reshape(sums.shape[0], *values.shape[1:])
-
-
-def _eliminated(
-    linear: _Linear, window: _Window, modes: F64, precision: F64, pull: F64, damping: float
-) -> tuple[F64, F64, tuple[F64, F64]]:
-    """Normal matrix [1 + R, 1 + R] and slope [1 + R] of log(focal) and shape, points and poses of a window solved for.
-
-    Then what gives these back: for points [3q, 6m + 1 + R + 1] by poses, focal and shape, and 1; for poses
-    [6m, 1 + R + 1] by focal and shape, and 1.
-    """
-    rows = window.observations
-    residual, pose, point, focal = (
-        part[rows] for part in (linear.residual, linear.pose, linear.point, linear.focal)
-    )
-    m, q, r = len(window.frames), len(window.points), modes.shape[2]
-    points = _summed(window.by_point, point.transpose(0, 2, 1) @ point)
-    points_focal = _summed(window.by_point, np.einsum("oki,ok->oi", point, focal)).reshape(-1)
-    points_slope = _summed(window.by_point, np.einsum("oki,ok->oi", point, residual))
-    cells = np.zeros((m, 6, q, 3))
-    cells[window.frame, :, window.point] = pose.transpose(0, 2, 1) @ point
-    cross = cells.reshape(6 * m, 3 * q)
-    basis = modes.reshape(3 * q, r)
-    points_shape = (points @ modes).reshape(3 * q, r)
-
-    normal: F64 = np.zeros((1 + r, 1 + r))
-    normal[0, 0] = (focal**2).sum()
-    normal[0, 1:] = normal[1:, 0] = points_focal @ basis
-    normal[1:, 1:] = basis.T @ points_shape
-    slope: F64 = np.concatenate([[(focal * residual).sum()], basis.T @ points_slope.reshape(-1)])
-    points_common = np.column_stack([points_focal, points_shape])
-    poses_focal = _summed(window.by_frame, np.einsum("oki,ok->oi", pose, focal)).reshape(-1)
-    poses_common = np.column_stack([poses_focal, cross @ basis])
-    poses_slope = _summed(window.by_frame, np.einsum("oki,ok->oi", pose, residual)).reshape(-1)
-    blocks = np.zeros((m, 6, m, 6))
-    own = _summed(window.by_frame, pose.transpose(0, 2, 1) @ pose)
-    blocks[np.arange(m), :, np.arange(m)] = own * (1 + damping * np.eye(6))
-    poses = blocks.reshape(6 * m, 6 * m)
-
-    right = np.column_stack([cross.T, points_common, (points_slope + pull).reshape(-1)])
-    gone: F64 = np.asarray(np.linalg.inv(points * (1 + damping) + precision), np.float64)
-    back: F64 = (gone @ right.reshape(q, 3, -1)).reshape(3 * q, -1)
-    poses -= cross @ back[:, : 6 * m]
-    rest = np.column_stack([poses_common, poses_slope]) - cross @ back[:, 6 * m :]
-    kept: F64 = np.asarray(np.linalg.solve(poses, rest), np.float64)
-    normal -= points_common.T @ back[:, 6 * m : -1] + rest[:, :-1].T @ kept[:, :-1]
-    slope -= points_common.T @ back[:, -1] + rest[:, :-1].T @ kept[:, -1]
-    return normal, slope, (back, kept)

@@ -2,7 +2,8 @@
 
 The upper face is a rigid body that turns before a camera whose focal length never changes, so all shots of a
 clip are adjusted together with one focal, under priors on it and on the shape of heads. What uncertainty is then left
-decides whether the clip has told the focal length.
+decides whether the clip has told the focal length. Of a long clip some frames tell the points, and these the poses of
+the rest.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracker.bundle_adjustment import RigidScene, absolute_pose, adjust, camera_model
-from tracker.feature_tracks import FeatureTracks, Frame, track_features
+from tracker.feature_tracks import FeatureTracks, Frame, track_features, turning
 from tracker.head import HeadModel, LandmarkEmbedding
+from tracker.key_frames import farthest
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, STEADY_CORNERS, UPPER_FACE
 from tracker.rigid_surface import SurfacePoints, surface_points
 from tracker.track import F64, Bundle, Camera, Landmarks
@@ -32,6 +34,10 @@ OUTLIER = 0.08
 FEW = 20  # landmarks of the upper face: a user's sparse embedding has less, and most of them on the nose's ridge
 MIN_OBSERVATIONS = 12  # of a frame in the bundle
 MIN_LENGTH = 3  # observations of a point in the bundle
+ADJUSTED, MOST_POINTS = 250, 600  # frames and points adjusted together: the time grows by their squares
+TRACK_OUTLIER = (
+    0.02  # of the distance between the outer eye corners: farther tracks do not count for a frame's pose
+)
 
 
 def estimate_camera(
@@ -55,14 +61,25 @@ def estimate_camera(
     segments = np.zeros(total, np.int32) if segments is None else segments
     prior = _camera(landmarks.size, focal_given, distortion)
     tracks = _straight(track_features(frames(), landmarks, usable, segments, progress), prior)
-    start, surface = _start(tracks, landmarks, head, prior)
-    if not len(start.observations):
+    some = tracks.select(_telling(landmarks.points[tracks.frames]), MOST_POINTS)
+    start, surface, kept = _start(some, landmarks, head, prior)
+    if not len(kept):
         return prior, _bundle(start)
     found = adjust(start, surface, prior.principal_px, prior.focal_px, prior.focal_sd_log)
     camera = prior if found is None else _told(prior, *found)
     if camera.method == "prior":  # the poses must fit its focal length
         found = adjust(start, surface, prior.principal_px, prior.focal_px, 0.0)
-    return camera, _bundle(start if found is None else _settled(found[0], surface))
+    if found is None:
+        return camera, _bundle(start.select(np.zeros(0, np.int64)))
+    return camera, _bundle(_resected(_settled(found[0], surface), tracks, kept, landmarks, camera))
+
+
+def _telling(points: NDArray[np.floating]) -> NDArray[np.int64]:
+    """ADJUSTED rows of landmarks [M, 478, 2 or 3] px at most: half spread over time, half over how the head turns."""
+    if len(points) <= ADJUSTED:
+        return np.arange(len(points))
+    spread = np.linspace(0, len(points) - 1, ADJUSTED // 2).round().astype(np.int64)
+    return np.sort(farthest(turning(points).astype(np.float64), spread, np.arange(len(points)), ADJUSTED))
 
 
 def _told(prior: Camera, scene: RigidScene, focal: float, sd_log: float) -> Camera:
@@ -101,21 +118,20 @@ def _camera(size: tuple[int, int], focal_given: float | None, distortion: tuple[
 
 
 def _turn_deg(scene: RigidScene) -> float:
-    """How far the direction from the head to the camera turns within a window, 5 % of the frames left out."""
+    """How far the direction from the head to the camera turns, 5 % of the frames left out."""
     towards = -np.einsum("mji,mj->mi", scene.rotation, scene.translation)
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    turns = [0.0]
-    for number in np.unique(scene.window):
-        mine = towards[scene.window == number]
-        middle = mine.mean(0) / np.linalg.norm(mine.mean(0))
-        turns.append(2 * float(np.quantile(np.arccos(np.clip(mine @ middle, -1, 1)), 0.95)))
-    return float(np.degrees(max(turns)))
+    middle = towards.mean(0) / np.linalg.norm(towards.mean(0))
+    return 2 * float(np.degrees(np.quantile(np.arccos(np.clip(towards @ middle, -1, 1)), 0.95)))
 
 
 def _start(
     tracks: FeatureTracks, landmarks: Landmarks, head: HeadModel, camera: Camera
-) -> tuple[RigidScene, SurfacePoints]:
-    """Poses from the mean head's landmarks, and points where the tracks run over its surface."""
+) -> tuple[RigidScene, SurfacePoints, NDArray[np.int64]]:
+    """Poses from the mean head's landmarks, points where the tracks run over its surface, and whose tracks these are.
+
+    Frames and points that see, or are seen, too little are left out.
+    """
     embedding = head.landmark_embedding
     rigid = rigid_landmarks(embedding)
     mean = np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis))
@@ -134,10 +150,9 @@ def _start(
         translation=np.array([translation for _, translation in known]).reshape(-1, 3),
         points=points.mean,
         observations=tracks.observations.astype(np.float64),
-        window=tracks.window[good],
     )
     pruned, kept = _pruned(scene)
-    return pruned, points.select(kept)
+    return pruned, points.select(kept), kept
 
 
 def rigid_landmarks(embedding: LandmarkEmbedding) -> NDArray[np.bool_]:
@@ -147,10 +162,7 @@ def rigid_landmarks(embedding: LandmarkEmbedding) -> NDArray[np.bool_]:
 
 
 def _pruned(scene: RigidScene) -> tuple[RigidScene, NDArray[np.int64]]:
-    """Without frames and points that see, or are seen, too little, and which points these are.
-
-    With none left, the poses alone stay.
-    """
+    """Without frames and points that see, or are seen, too little, and which points are left."""
     rows = scene.observations[np.isfinite(scene.points[scene.observations[:, 1].astype(int)]).all(1)]
     rows = rows[np.isin(rows[:, 0], scene.frames)]
     while len(rows):
@@ -159,21 +171,45 @@ def _pruned(scene: RigidScene) -> tuple[RigidScene, NDArray[np.int64]]:
         if keep.all():
             break
         rows = rows[keep]
-    if not len(rows):
-        nothing = replace(scene, points=np.zeros((0, 3)), observations=np.zeros((0, 4)))
-        return nothing, np.zeros(0, np.int64)
-    seen = np.isin(scene.frames, rows[:, 0])
     kept, number = np.unique(rows[:, 1].astype(int), return_inverse=True)
-    left = replace(
+    left = scene.select(np.flatnonzero(np.isin(scene.frames, rows[:, 0])))
+    return replace(
+        left, points=scene.points[kept], observations=np.column_stack([rows[:, 0], number, rows[:, 2:]])
+    ), kept
+
+
+def _resected(
+    scene: RigidScene, tracks: FeatureTracks, kept: NDArray[np.int64], landmarks: Landmarks, camera: Camera
+) -> RigidScene:
+    """The scene with the frames that were followed but not adjusted, each where its points put it.
+
+    kept: [Q], numbers of the tracks that are the scene's points.
+    """
+    model = camera_model(camera.focal_px, camera.principal_px, camera.size)
+    frames, poses, seen = [], [], []
+    for frame in np.setdiff1d(tracks.frames, scene.frames).tolist():
+        rows = tracks.observations[tracks.observations[:, 0] == frame].astype(np.float64)
+        rows = rows[np.isin(rows[:, 1], kept)]
+        rows[:, 1] = np.searchsorted(kept, rows[:, 1])
+        right, left = landmarks.points[frame, [RIGHT_EYE_OUTER, LEFT_EYE_OUTER], :2]
+        error = TRACK_OUTLIER * float(np.linalg.norm(left - right))
+        if len(rows) < MIN_OBSERVATIONS:
+            continue
+        pose = absolute_pose(rows[:, 2:], scene.points[rows[:, 1].astype(int)], model, error)
+        if pose is not None:
+            frames.append(frame)
+            poses.append(pose)
+            seen.append(rows)
+    if not frames:
+        return scene
+    order = np.argsort(np.concatenate([scene.frames, frames]))
+    return replace(
         scene,
-        frames=scene.frames[seen],
-        rotation=scene.rotation[seen],
-        translation=scene.translation[seen],
-        window=scene.window[seen],
-        points=scene.points[kept],
-        observations=np.column_stack([rows[:, 0], number, rows[:, 2:]]),
+        frames=np.concatenate([scene.frames, np.array(frames, np.int32)])[order],
+        rotation=np.concatenate([scene.rotation, [rotation for rotation, _ in poses]])[order],
+        translation=np.concatenate([scene.translation, [translation for _, translation in poses]])[order],
+        observations=np.concatenate([scene.observations, *seen]),
     )
-    return left, kept
 
 
 def _settled(scene: RigidScene, surface: SurfacePoints) -> RigidScene:

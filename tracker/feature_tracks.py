@@ -1,4 +1,4 @@
-"""Feature tracks on the rigid upper face: patches found again within a window, never from one shot in another."""
+"""Feature tracks on the rigid upper face: patches found again all through the clip, as each was first seen."""
 
 from __future__ import annotations
 
@@ -14,11 +14,8 @@ from tracker.patch_registration import NO_TEMPLATES, cut_templates, fine_texture
 from tracker.track import F32, F64, Landmarks
 
 SPACING_S = 0.12  # between the frames that are followed: about every third at 25 fps
-WINDOW = 25  # followed frames, 3 s: the unit in which a long clip is thinned
-LONGEST = 75  # followed frames, after which tracks begin anew: what is adjusted at once
-MAX_FRAMES = 400
 MIN_PRESENCE = 0.5
-CORNERS = 250
+CORNERS, PATCHES = 250, 1500  # wanted in a picture, and in all of a clip
 REPLENISH = 5  # followed frames between searches for new corners
 EYE_DISTANCE = (
     160.0  # px between the outer eye corners, at most: a larger face is followed in a smaller picture
@@ -32,45 +29,41 @@ Frame = tuple[float, NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class FeatureTracks:
-    """What was followed. frames: [M] i4, ascending. window: [M] i4, tracks live within one window.
+    """What was followed. frames: [M] i4, ascending.
 
     observations: [O, 4] f4 (frame, track, x px, y px), by frame; tracks are numbered 0..Q-1.
     """
 
     frames: NDArray[np.int32]
-    window: NDArray[np.int32]
     observations: F32
 
+    def select(self, rows: NDArray[np.integer], most: int) -> FeatureTracks:
+        """What was seen in some of the frames: of the tracks that are left those longest there, numbered as before."""
+        frames = self.frames[rows]
+        seen = self.observations[np.isin(self.observations[:, 0], frames)]
+        number = seen[:, 1].astype(np.int64)
+        longest = np.argsort(-np.bincount(number, minlength=1), kind="stable")[:most]
+        return FeatureTracks(frames, seen[np.isin(number, longest)])
 
-def choose_frames(
+
+def followed_frames(
     landmarks: Landmarks, usable: NDArray[np.bool_], segments: NDArray[np.int32]
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Frames to follow and the window of each, both [M]: of a long clip, the parts in which the head turns most.
+) -> NDArray[np.int32]:
+    """[M] frames to follow: the first of each shot in which a face is seen, then one about every SPACING_S.
 
     usable: [T] bool. segments: [T], number of the uninterrupted shot.
     """
-    good = usable & (landmarks.presence >= MIN_PRESENCE)
-    interval = float(np.median(np.diff(landmarks.time))) if len(landmarks.time) > 1 else SPACING_S
-    step = max(1, round(SPACING_S / max(interval, 1e-3)))
-    starts = np.flatnonzero(np.diff(np.where(good, segments, -1), prepend=-2))
-    runs = [run[::step] for run in np.split(np.arange(len(good)), starts[1:]) if good[run].all()]
-    windows = [run[i : i + WINDOW] for run in runs for i in range(0, len(run), WINDOW)]
-    windows = [window for window in windows if len(window) >= MIN_LENGTH]
-    turn = [np.ptp(turning(landmarks.points[window]), axis=0).max() for window in windows]
-    kept: list[int] = []
-    for i in np.argsort(turn)[::-1]:
-        if sum(len(windows[k]) for k in kept) + len(windows[i]) <= MAX_FRAMES:
-            kept.append(int(i))
-    empty = np.zeros(0, np.int32)
-    if not kept:
-        return empty, empty
-    chosen = [windows[i] for i in sorted(kept)]
-    frames = np.concatenate(chosen).astype(np.int32)
-    # Neighbours in one shot are one window: tracks live on.
-    apart = (np.diff(frames) != step) | (np.diff(segments[frames]) != 0)
-    joined = np.concatenate([[0], np.cumsum(apart)])
-    age = np.arange(len(frames)) - np.searchsorted(joined, joined)
-    return frames, np.unique(joined * len(frames) + age // LONGEST, return_inverse=True)[1].astype(np.int32)
+    good = np.flatnonzero(usable & (landmarks.presence >= MIN_PRESENCE))
+    interval = float(np.median(np.diff(landmarks.time))) if len(landmarks.time) > 1 else 0.0
+    chosen: list[int] = []
+    for frame in good.tolist():
+        if (
+            not chosen
+            or segments[frame] != segments[chosen[-1]]
+            or landmarks.time[frame] - landmarks.time[chosen[-1]] > SPACING_S - interval / 2
+        ):
+            chosen.append(frame)
+    return np.array(chosen, np.int32)
 
 
 def turning(points: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -90,30 +83,27 @@ def track_features(
     segments: NDArray[np.int32],
     progress: Callable[[int, int], None] | None = None,
 ) -> FeatureTracks:
-    """Follows about CORNERS corners of the rigid upper face through the clip.
+    """Follows about CORNERS corners of the rigid upper face through the clip, its cuts included: it stays one face.
 
     frames: (time s, rgb [H, W, 3] u8), as many as the landmarks. usable: [T] bool. segments: [T], number of the
     uninterrupted shot.
     """
-    chosen, window = choose_frames(landmarks, usable, segments)
+    chosen = followed_frames(landmarks, usable, segments)
     total = len(landmarks.time)
     eyes = landmarks.points[chosen][:, [RIGHT_EYE_OUTER, LEFT_EYE_OUTER], :2]
     distance = float(np.median(np.linalg.norm(eyes[:, 0] - eyes[:, 1], axis=-1))) if len(chosen) else 1.0
     follower = _Follower(min(1.0, EYE_DISTANCE / distance))
-    place = {int(frame): i for i, frame in enumerate(chosen)}
+    wanted = set(chosen.tolist())
     rows = []
     for index, (_, rgb) in enumerate(frames):
         if progress is not None:
             progress(index + 1, total)
-        if index not in place:
+        if index not in wanted:
             continue
-        i = place[index]
-        if i == 0 or window[i] != window[i - 1]:
-            follower.reset()
         tracks, xy = follower.next(rgb, landmarks.points[index, :, :2])
         rows.append(np.column_stack([np.full(len(tracks), index), tracks, xy]))
     observations = _long_tracks(np.concatenate(rows) if rows else np.zeros((0, 4)))
-    return FeatureTracks(chosen, window, observations)
+    return FeatureTracks(chosen, observations)
 
 
 def _long_tracks(observations: NDArray[np.float64]) -> F32:
@@ -134,13 +124,7 @@ class _Follower:
 
     def __init__(self, scale: float) -> None:
         self._scale = scale
-        self._next_number = 0
-        self.reset()
-
-    def reset(self) -> None:
-        """Drops all patches."""
         self._templates = NO_TEMPLATES
-        self._numbers = np.zeros(0, np.int64)
         self._begun = np.zeros((0, 2))  # px, where each was first seen
         self._face = np.zeros((0, len(UPPER_FACE), 2))  # px, the landmarks there
         self._offset = np.zeros((0, 2))  # px, from where the landmarks put it to where it was last
@@ -155,16 +139,15 @@ class _Follower:
         face = ((points + 0.5) * scale - 0.5).astype(np.float32)
         region, texture = upper_face_mask(face, gray.shape), fine_texture(gray)
         rows, xy = self._found(texture, face, region)
-        numbers = self._numbers[rows]
         if self._age % REPLENISH == 0:
             more, places = self._replenished(texture, face, region, xy)
-            numbers, xy = np.concatenate([numbers, more]), np.concatenate([xy, places])
+            rows, xy = np.concatenate([rows, more]), np.concatenate([xy, places])
         self._age += 1
-        return numbers, ((xy + 0.5) / scale - 0.5).astype(np.float32)
+        return rows, ((xy + 0.5) / scale - 0.5).astype(np.float32)
 
     def _found(self, texture: F32, face: F32, region: NDArray[np.uint8]) -> tuple[NDArray[np.int64], F64]:
         """Rows [n] of the patches seen again, and where [n, 2] px."""
-        if not len(self._numbers):
+        if not len(self._begun):
             return np.zeros(0, np.int64), np.zeros((0, 2))
         reach = REACH * float(np.linalg.norm(face[LEFT_EYE_OUTER] - face[RIGHT_EYE_OUTER]))
         expected, bend = _carried(self._begun, self._face, face[list(UPPER_FACE)].astype(np.float64), reach)
@@ -180,7 +163,7 @@ class _Follower:
         self, texture: F32, face: F32, region: NDArray[np.uint8], seen: F64
     ) -> tuple[NDArray[np.int64], F64]:
         """Numbers [n] and places [n, 2] px of new patches where none of those seen [k, 2] px is."""
-        wanted = CORNERS - len(seen)
+        wanted = min(CORNERS - len(seen), PATCHES - len(self._begun))
         # Evenly over the region: as many corners as fit at this distance.
         apart = max(2.0, 0.7 * np.sqrt(np.count_nonzero(region) / CORNERS))
         free = region.copy()
@@ -195,10 +178,8 @@ class _Follower:
         templates = cut_templates(texture, places)
         sound = templates.corners()
         places, count = places[sound], int(sound.sum())
-        numbers = self._next_number + np.arange(count)
-        self._next_number += count
+        numbers = len(self._begun) + np.arange(count)
         self._templates = self._templates.joined(templates.select(sound))
-        self._numbers = np.concatenate([self._numbers, numbers])
         self._begun = np.concatenate([self._begun, places])
         landmarks = np.broadcast_to(face[list(UPPER_FACE)], (count, len(UPPER_FACE), 2))
         self._face = np.concatenate([self._face, landmarks])

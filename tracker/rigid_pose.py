@@ -2,7 +2,7 @@
 
 Landmarks err in blocks that move with the head, so a pose fitted to them swings by a degree. The bundle's poses do
 not, but they stand in a head frame of their own and exist on every third frame or so; the difference to the
-landmarks' poses, one similarity for each window taken out, is carried over to the frames between.
+landmarks' poses, one similarity for the clip taken out, is carried over to the frames between.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from tracker.track import F64, Bundle
 Rows = NDArray[np.int64]
 Corrections = list[tuple[Rows, F64]]
 
-MIN_FRAMES = 8  # of a window: fewer do not tell how the two head frames lie to each other
-# Of the turn between the two poses in a window. On all heads whose truth is known 95 % are below 2.3 degrees, and are
+MIN_FRAMES = 8  # fewer do not tell how the two head frames lie to each other
+# Of the turn between the two poses. On all heads whose truth is known 95 % are below 2.3 degrees, and are
 # the landmarks' error; beyond it brows move, and what the tracks follow is not one rigid body.
 PLAUSIBLE, PLAUSIBLE_QUANTILE = np.radians(2.5), 0.95
 CERTAIN = np.array([[1.0], [1.0], [0.1]])  # of a landmark pose's place: depth is seen ten times less well
 LEAST_SEEN = 0.3  # of the points that a frame of the bundle usually sees: with fewer its pose may be anything
-FADE = 12  # frames beyond the end of a window over which its correction fades
+FADE = 12  # frames beyond the last one known over which its correction fades
 
 
 def hold_poses(x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], sound: Rows, share: float) -> F64:
@@ -33,27 +33,28 @@ def hold_poses(x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], sound
     run: [n], frames of one number follow each other without a break; nothing is carried from one to another.
     sound: rows of x whose poses tell how the two head frames lie to each other, and where the difference is known.
     """
-    known = np.isin(bundle.frame, good[sound])
-    row, well_seen = np.searchsorted(good, bundle.frame[known]), _well_seen(bundle)[known]
+    known = np.isin(bundle.frame, good[sound]) & _well_seen(bundle)
+    row = np.searchsorted(good, bundle.frame[known])
+    if len(row) < MIN_FRAMES:
+        return x
     rotation = Rotation.from_rotvec(bundle.rotation[known]).as_matrix()
-    translation = bundle.translation[known].astype(np.float64)
-    step = np.median(np.diff(bundle.frame)) if len(bundle.frame) > 1 else 1
+    change = _corrections(x[row], rotation, bundle.translation[known].astype(np.float64))
+    if np.quantile(np.linalg.norm(change[:, :3], axis=1), PLAUSIBLE_QUANTILE) > PLAUSIBLE:
+        return x
+    step = np.median(np.diff(bundle.frame))
     ends = np.flatnonzero((np.diff(row) > 1.5 * step) | (np.diff(run[row]) != 0)) + 1
-    out = x.copy()
-    found: dict[int, Corrections] = {}
+    stretches: dict[int, Corrections] = {}
     for part in np.split(np.arange(len(row)), ends):
-        part = part[well_seen[part]]
-        if len(part) < MIN_FRAMES:
-            continue
-        change = _corrections(x[row[part]], rotation[part], translation[part])
-        if np.quantile(np.linalg.norm(change[:, :3], axis=1), PLAUSIBLE_QUANTILE) <= PLAUSIBLE:
-            found.setdefault(int(run[row[part[0]]]), []).append((row[part], change))
-    for number, windows in found.items():
+        # Landmarks drift slowly; what changes from one known frame to the next is noise of either.
+        smooth = convolve1d(change[part], [0.25, 0.5, 0.25], axis=0, mode="nearest")
+        stretches.setdefault(int(run[row[part[0]]]), []).append((row[part], smooth))
+    out = x.copy()
+    for number, found in stretches.items():
         mine = np.flatnonzero(run == number)
-        change = share * _between(windows, mine)
-        turned = Rotation.from_rotvec(change[:, :3]).as_matrix() @ rotation_matrix(x[mine, -6:-3])
+        moved = share * _between(found, mine)
+        turned = Rotation.from_rotvec(moved[:, :3]).as_matrix() @ rotation_matrix(x[mine, -6:-3])
         out[mine, -6:-3] = rotation_vector(turned)
-        out[mine, -3:] += change[:, 3:]
+        out[mine, -3:] += moved[:, 3:]
     return out
 
 
@@ -76,16 +77,14 @@ def _corrections(x: F64, rotation: F64, translation: F64) -> F64:
     told = np.linalg.lstsq((CERTAIN * system).reshape(-1, 4), (CERTAIN[:, 0] * place).reshape(-1), rcond=None)
     moved = system @ told[0]
     turn = Rotation.from_matrix(target @ own.transpose(0, 2, 1)).as_rotvec()
-    change = np.concatenate([turn, moved - place], axis=1)
-    # Landmarks drift slowly; what changes from one known frame to the next is noise of either.
-    return convolve1d(change, [0.25, 0.5, 0.25], axis=0, mode="nearest")
+    return np.concatenate([turn, moved - place], axis=1)
 
 
-def _between(windows: Corrections, rows: Rows) -> F64:
+def _between(stretches: Corrections, rows: Rows) -> F64:
     """[len(rows), 6] corrections of all rows of one run: linear between those known, none far from all of them."""
-    known = np.concatenate([row for row, _ in windows])
-    change = np.concatenate([part for _, part in windows])
-    far = [edge for row, _ in windows for edge in (row[0] - FADE, row[-1] + FADE)]
+    known = np.concatenate([row for row, _ in stretches])
+    change = np.concatenate([part for _, part in stretches])
+    far = [edge for row, _ in stretches for edge in (row[0] - FADE, row[-1] + FADE)]
     far = [edge for edge in far if np.abs(known - edge).min() >= FADE]
     places = np.concatenate([known, np.array(far, np.int64)])
     values = np.concatenate([change, np.zeros((len(far), 6))])
