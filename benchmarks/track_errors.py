@@ -33,10 +33,12 @@ Similarity = tuple[float, F64, F64]
 def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, float]:
     """Errors by name: mm, degrees, frames, shares, or r for correlations; NaN where the clip cannot tell.
 
-    Frames in which something covers the lips count for confidence and recovery alone.
+    Frames in which something covers the lips count for confidence and recovery alone, bare ones that the track lacks
+    for recovery and for lost_pct, their share in %.
     """
     fitted = axis_angle_to_rotation_matrix(from_numpy(track.rotation.astype(np.float64))).numpy()
-    judged = track.valid & (truth.covered <= COVERED)
+    bare = truth.covered <= COVERED
+    judged = track.valid & bare
     resting = np.zeros(len(head.expression_names), np.float32)
     neutral = head.vertices(track.identity, resting).astype(np.float64)
     mean = head.template.astype(np.float64)
@@ -51,8 +53,8 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
         "rotation_deg": rotation_error(fitted[judged], truth.rotation[judged]),
         "focal_pct": 100 * (track.focal / truth.focal - 1),
         "turn_deg": turn(truth.rotation),
-        "confidence_auc": separation(track.confidence, truth.covered > COVERED),
-        "unseen_pct": 100 * float(1 - track.valid.mean()),
+        "confidence_auc": separation(track.confidence, ~bare),
+        "lost_pct": 100 * float(1 - track.valid[bare].mean()),
     }
 
 

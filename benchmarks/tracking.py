@@ -18,6 +18,7 @@ jitter, still   second difference of the lips' error; face vertices' rms on a cl
 close           share of the closures of the lips that are reached within one frame
 auc             how often a covered frame has less confidence than a clear one
 back            frames until the fit recovers from a hand or a fast turn
+lost            share of the frames with bare lips that have no fit, and so count in no error but `back`, %
 ms              processor time of landmarks, camera and all stages up to here, a frame
 """
 
@@ -72,9 +73,10 @@ COLUMNS = {
     "close": "closures",
     "auc": "confidence_auc",
     "back": "recovery_frames",
+    "lost": "lost_pct",
     "ms": "ms",
 }
-DECIMALS = {"r": 3, "jitter": 3, "still": 3, "focal": 1, "back": 0, "ms": 0}
+DECIMALS = {"r": 3, "jitter": 3, "still": 3, "focal": 1, "back": 0, "lost": 1, "ms": 0}
 EMPTY = np.zeros((0, 3), np.float32)
 NO_BUNDLE = Bundle(np.zeros(0, np.int32), EMPTY, EMPTY, EMPTY, np.zeros((0, 4), np.float32))
 

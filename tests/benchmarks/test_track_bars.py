@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.track_bars import Bar, Row, last_stages, print_bars
+from benchmarks.track_bars import BARS, Bar, Row, last_stages, print_bars
 
 
 def rows() -> list[Row]:
@@ -43,6 +43,15 @@ def test_focal_counts_only_where_the_head_turns() -> None:
 def test_a_still_face_does_not_lower_the_mean_of_motion_errors() -> None:
     still = Row("own", "d", "refined", {"opening_centred_mm": 0.0, "lip_motion_truth": 0.0})
     assert Bar("about", ("own",), "opening_centred_mm", 0.6).reached([*last_stages(rows()), still]) == 0.5
+
+
+def test_frames_lost_on_one_clip_are_not_averaged_away() -> None:
+    kept, lost = (
+        Row("person", "kept", "landmarks", {"lost_pct": 0.0}),
+        Row("own", "a", "refined", {"lost_pct": 1.4}),
+    )
+    (bar,) = (bar for bar in BARS if bar.error == "lost_pct")
+    assert bar.reached([kept] * 9 + [lost]) == 1.4 and not bar.holds(1.4) and bar.holds(0.7)
 
 
 def test_printed_answers() -> None:

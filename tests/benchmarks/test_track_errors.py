@@ -185,6 +185,16 @@ def test_covered_frames_do_not_count(exact: tuple[Track, GroundTruth], head: Hea
         assert errors[name] == pytest.approx(0, abs=0.01), name
 
 
+def test_bare_frames_without_a_fit_are_lost(exact: tuple[Track, GroundTruth], head: HeadModel) -> None:
+    track, truth = exact
+    assert compare(track, head, truth)["lost_pct"] == 0
+    valid, covered = np.ones(FRAMES, bool), np.zeros(FRAMES)
+    valid[[4, 5, 9]] = False
+    covered[[5, 6]] = 1.0, 0.1  # a hand over the lips; one that leaves them as good as bare
+    errors = compare(replace(track, valid=valid), head, replace(truth, covered=covered))
+    assert errors["lost_pct"] == pytest.approx(100 * 2 / 11)
+
+
 def test_a_turn_there_and_back_is_one_disturbance(exact: tuple[Track, GroundTruth]) -> None:
     _, truth = exact
     angle = np.array([0, 0, 0, 8, 20, 30, 31, 30, 20, 8, 0, 0])[:, None]

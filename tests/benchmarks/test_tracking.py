@@ -15,7 +15,9 @@ def test_one_clip_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     assert row.split()[:2] == ["person1", "landmarks"] and len(row) == len(header)
     surface, mean = (float(row.split()[2 + k]) for k in range(2))
     assert surface < mean
+    assert row.split()[header.split().index("lost")] == "0.0"
     assert any(line.startswith("in model: rotation") for line in bars)
+    assert any(line.startswith("frames with bare lips lost") and line.endswith("yes") for line in bars)
 
 
 def test_unknown_clip_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
