@@ -9,7 +9,9 @@ from __future__ import annotations
 import numpy as np
 from kornia.geometry import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing
+from scipy.ndimage import binary_closing, minimum_filter1d
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_bipartite_matching
 from scipy.spatial import cKDTree
 from scipy.stats import rankdata
 from torch import from_numpy
@@ -21,6 +23,7 @@ from tracker.track import F64, Track
 
 NORMAL_M = 0.01  # two points whose normals differ by a unit count as this far apart
 CLOSED_MM = 0.5
+AJAR_MM = CLOSED_MM + 0.3  # true lips hover about the limit, and openings may err by so much
 COVERED = 0.2  # share of the lips from which a frame counts as covered
 FAST_DEG = 4.0  # head rotation a frame from which a turn counts as fast
 RECOVERED = 1.5  # times the median error
@@ -33,8 +36,8 @@ Similarity = tuple[float, F64, F64]
 def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, float]:
     """Errors by name: mm, degrees, frames, shares, or r for correlations; NaN where the clip cannot tell.
 
-    Frames in which something covers the lips count for confidence and recovery alone, bare ones that the track lacks
-    for recovery and for lost_pct, their share in %.
+    Frames in which something covers the lips count for confidence and recovery alone; bare ones that have no
+    fit for recovery and as lost_pct, their share in %.
     """
     fitted = axis_angle_to_rotation_matrix(from_numpy(track.rotation.astype(np.float64))).numpy()
     bare = truth.covered <= COVERED
@@ -140,19 +143,36 @@ def opening_errors(gap: F64, true: F64, judged: Bool) -> dict[str, float]:
         "opening_centred_mm": float(error.std()),
         "closed_mm": float(np.median(error[closed])) if closed.any() else np.nan,
         "closures": closures_reached(gap, np.where(judged, true, np.nan)),
+        "false_closures": closures_invented(np.where(judged, gap, np.nan), true),
     }
 
 
 def closures_reached(gap: F64, true: F64) -> float:
-    """Share of the moments at which the true lips [T] mm close that the fitted ones close within one frame of."""
+    """Share of the moments at which the true lips [T] mm close that have a fitted closing within one frame.
 
-    def closing(curve: F64) -> NDArray[np.int64]:
-        return np.flatnonzero((curve[1:] < CLOSED_MM) & (curve[:-1] >= CLOSED_MM)) + 1
-
-    moments, found = closing(true), closing(gap)
+    A fitted closing serves one moment only.
+    """
+    moments, found = _closings(true), _closings(gap)
     if not len(moments):
         return np.nan
-    return float((np.abs(moments[:, None] - found) <= 1).any(1).mean())
+    near = csr_array(np.abs(moments[:, None] - found) <= 1)
+    return float((maximum_bipartite_matching(near, perm_type="column") >= 0).mean())
+
+
+def closures_invented(gap: F64, true: F64) -> float:
+    """Share of the moments at which fitted lips [T] mm close where the true ones are open for a frame around.
+
+    Open by AJAR_MM: a closing upon lips that are all but shut is a small error of the opening, no invention.
+    """
+    found = _closings(gap)
+    if not len(found):
+        return np.nan
+    return float((minimum_filter1d(true, 3)[found] >= AJAR_MM).mean())
+
+
+def _closings(gap: F64) -> NDArray[np.int64]:
+    """The first frames in which the lips [T] mm are closed again; none beside NaN."""
+    return np.flatnonzero((gap[1:] < CLOSED_MM) & (gap[:-1] >= CLOSED_MM)) + 1
 
 
 def separation(confidence: NDArray[np.floating], covered: Bool) -> float:

@@ -15,7 +15,7 @@ neutr           lip vertices against the neutral, mm
 r, rmse, about  lip opening: correlation, RMSE, RMSE about its mean, mm
 rot, focal      head rotation without the constant, degrees; focal length, %
 jitter, still   second difference of the lips' error; face vertices' rms on a clip where nothing moves, mm
-close           share of the closures of the lips that are reached within one frame
+close, false    share of the lips' closures reached within one frame; of the fitted ones, upon open lips
 auc             how often a covered frame has less confidence than a clear one
 back            frames until the fit recovers from a hand or a fast turn
 lost            share of the frames with bare lips that have no fit, and so count in no error but `back`, %
@@ -71,6 +71,7 @@ COLUMNS = {
     "jitter": "jitter_mm",
     "still": "still_mm",
     "close": "closures",
+    "false": "false_closures",
     "auc": "confidence_auc",
     "back": "recovery_frames",
     "lost": "lost_pct",

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.ground_truth import GroundTruth
 from benchmarks.track_errors import (
+    closures_invented,
     closures_reached,
     compare,
     disturbed,
@@ -145,7 +146,39 @@ def test_closures_within_one_frame() -> None:
     late = np.array([3, 3, 0, 3, 3, 3, 0, 3, 3, 3.0])  # one frame, two frames, never
     assert closures_reached(true, true) == 1
     assert closures_reached(late, true) == pytest.approx(1 / 3)
+    assert closures_reached(true + 5, true) == 0
     assert np.isnan(closures_reached(true, true + 5))
+
+
+def test_a_fitted_closing_serves_one_closure() -> None:
+    true = np.array([3, 0, 3, 0, 3, 3, 0, 3.0])
+    between = np.array([3, 3, 0, 3, 3, 3, 3, 3.0])  # a frame from the first two
+    assert closures_reached(between, true) == pytest.approx(1 / 3)
+    # The first closing lies beside two closures, one of which is the second's only one.
+    assert closures_reached(np.array([0, 3, 0, 3, 0, 3, 3, 3.0]), true) == pytest.approx(2 / 3)
+
+
+def test_closing_on_open_lips_is_false() -> None:
+    true = np.array([3, 0, 3, 3, 3, 3, 0.7, 3, 3, 3])
+    fitted = np.array([3, 3, 0, 3, 0, 3, 0.4, 3, 3, 3])  # a frame late, on open lips, on lips all but shut
+    assert closures_invented(fitted, true) == pytest.approx(1 / 3)
+    assert closures_invented(true, true) == 0
+    assert np.isnan(closures_invented(true + 5, true))
+
+
+def test_flicker_about_the_limit_reaches_all_closures_and_invents_more() -> None:
+    true = np.tile([4, 3, 2, 0, 0, 2, 3, 4.0], 5)
+    flicker = np.where(np.arange(len(true)) % 2, 0.4, 0.6)
+    errors = opening_errors(flicker, true, np.ones(len(true), bool))
+    assert errors["closures"] == 1 and errors["false_closures"] == pytest.approx(0.5)
+    assert closures_invented(flicker, np.full(len(true), 0.6)) == 0  # where lips hover there, it is no flaw
+
+
+def test_unseen_closings_are_not_false() -> None:
+    true, fitted = np.full(8, 3.0), np.array([3, 3, 0, 3, 3, 0, 3, 3.0])
+    errors = opening_errors(fitted, true, np.arange(8) != 5)
+    assert errors["false_closures"] == 1
+    assert np.isnan(opening_errors(fitted, true, ~np.isin(np.arange(8), (2, 5)))["false_closures"])
 
 
 def test_separation_is_the_area_under_the_curve() -> None:
