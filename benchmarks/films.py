@@ -1,6 +1,6 @@
 """The bench's films: a stranger before a camera, lit, blurred, noisy and compressed, and the truth behind it.
 
-A film is made once: it lies in the cache under a hash of its scene, of the head and of the code that made it.
+A film is made once: it lies in the cache under a hash of scene, head, speech and the code that made it.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from benchmarks.ground_truth import GroundTruth
 from benchmarks.rendered_heads import FPS, Scene, scene_motion, stranger
 from personalize import talkers, video_writer
 from personalize.feature_cache import cache_folder
-from personalize.files import sha256_json
+from personalize.files import sha256_file, sha256_json
 from personalize.render import mouth
 from personalize.talkers.motion import TalkerMotion
 from personalize.talkers.skin import backdrop, skin_block, texture
 from personalize.video_writer import VideoWriter
+from tracker import head as head_model
 from tracker import raster
 from tracker.head import HeadModel
 from tracker.raster import project, rasterize, shade, vertex_normals
@@ -41,7 +42,10 @@ LIP_GLOSS = 1.8  # of the skin's
 LIP_SOFTNESS = 0.4
 HAND_COLOUR = (205.0, 165.0, 148.0)
 MADE_BY = (
-    *(module.__file__ for module in (ground_truth, mouth, props, rendered_heads, raster, video_writer)),
+    *(
+        module.__file__
+        for module in (ground_truth, head_model, mouth, props, raster, rendered_heads, video_writer)
+    ),
     *sorted(str(path) for path in Path(talkers.__path__[0]).glob("*.py")),
     __file__,
 )
@@ -49,18 +53,26 @@ MADE_BY = (
 
 def film(scene: Scene, head: HeadModel) -> tuple[Path, GroundTruth]:
     """The film of a scene (MP4) and its truth, made now or earlier."""
-    # As syntax: comments and layout change no film.
-    code = [ast.dump(ast.parse(Path(str(file)).read_text())) for file in MADE_BY]
-    key = sha256_json([asdict(scene), head.sha256, code])[:16]
     folder = cache_folder().with_name("films")
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{scene.name}_{key}.mp4"
+    path = folder / f"{scene.name}_{film_key(scene, head)}.mp4"
     # The truth is written after the film: when it is there, both are whole.
     if path.with_suffix(".npz").is_file():
         return path, GroundTruth.read(path.with_suffix(".npz"))
     truth = shoot(scene, head, path)
     truth.write(path.with_suffix(".npz"))
     return path, truth
+
+
+def film_key(scene: Scene, head: HeadModel) -> str:
+    """Hash of all that a scene's film is made of."""
+    # As syntax: comments and layout change no film.
+    code = [ast.dump(ast.parse(Path(str(file)).read_text())) for file in MADE_BY]
+    # The head's own hash is of its geometry alone.
+    regions = {name: vertices.tolist() for name, vertices in head.regions.items()}
+    joints = {name: [part.tolist() for part in vars(joint).values()] for name, joint in head.joints.items()}
+    person = [head.sha256, head.expression_names, regions, joints, head.albedo.tolist()]
+    return sha256_json([asdict(scene), person, sha256_file(rendered_heads.SPEECH), code])[:16]
 
 
 def shoot(scene: Scene, head: HeadModel, path: Path) -> GroundTruth:

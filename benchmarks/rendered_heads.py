@@ -20,6 +20,7 @@ from tracker.head import HeadModel
 from tracker.track import F64
 
 FPS = 25.0
+SPEECH = ASSETS / "demo_speech.json"
 WAVES, BEND_LENGTH_M, WARP_LENGTH_M = 24, 0.05, 0.04
 FACE_DEPTH_M = 0.085  # of the face before the head's origin
 TURN_S, TURN_BACK_S, TURN_RISE_S = (
@@ -185,7 +186,7 @@ def scene_motion(scene: Scene) -> TalkerMotion:
 
 
 def _phones(start: float) -> list[Phone]:
-    phones = load_phones(ASSETS / "demo_speech.json")
+    phones = load_phones(SPEECH)
     return [Phone(p.name, p.start - start, p.end - start) for p in phones if p.end > start]
 
 

@@ -1,14 +1,16 @@
 """The bench's films: the landmarker finds their faces where the truth has them, props cover what they should."""
 
+import ast
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.films import _Studio, film, shoot
+from benchmarks.films import MADE_BY, _Studio, film, film_key, shoot
 from benchmarks.ground_truth import GroundTruth
-from benchmarks.rendered_heads import SCENES, Scene, scene_motion, stranger
+from benchmarks.rendered_heads import SCENES, SPEECH, Scene, scene_motion, stranger
 from personalize.pictures import read_frames
 from personalize.render.mouth import furnished
 from tests.personalize.mouth_view import assert_seen_between_parted_lips_only
@@ -17,6 +19,12 @@ from tracker.landmarker import track_landmarks
 from tracker.raster import project
 
 SCENE = Scene("tiny", 5, seconds=0.2, head=0.5)
+ROOT = Path(__file__).parents[2]
+# What is imported and changes no film: where and how files lie, types, sound, heads of another kind.
+NO_MAKERS = {
+    *("personalize/feature_cache.py", "personalize/files.py", "personalize/sound.py"),
+    *("tracker/skinning.py", "tracker/track.py"),
+}
 
 
 @pytest.fixture(scope="module")
@@ -82,3 +90,35 @@ def test_a_film_is_made_once(shot: tuple[Path, GroundTruth], monkeypatch: pytest
     assert again == path and made[0] == path and len(made) == 2
     np.testing.assert_allclose(read.displacement, truth.displacement, atol=1e-5)
     np.testing.assert_array_equal(read.vertices, truth.vertices)
+
+
+def test_another_look_is_another_film() -> None:
+    head = load_head()
+    redder, lips = head.albedo.copy(), head.regions["lips"]
+    redder[lips[0], 0] -= 1
+    others = [
+        replace(head, albedo=redder),
+        replace(head, regions=head.regions | {"lips": lips[1:]}),
+        replace(head, joints=head.joints | {"left_eye": head.joints["right_eye"]}),
+    ]
+    keys = [film_key(SCENE, head), *(film_key(SCENE, other) for other in others)]
+    assert len(set(keys)) == 4 and film_key(SCENE, replace(head, name="same")) == keys[0]
+
+
+def test_another_speech_is_another_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    key = film_key(SCENE, load_head())
+    (tmp_path / "speech.json").write_text(SPEECH.read_text() + "\n")
+    monkeypatch.setattr("benchmarks.rendered_heads.SPEECH", tmp_path / "speech.json")
+    assert film_key(SCENE, load_head()) != key
+
+
+def test_all_code_that_films_come_from_is_in_their_key() -> None:
+    def imported(path: Path) -> Iterator[str]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = (node.module, *(f"{node.module}.{alias.name}" for alias in node.names))
+                yield from (f"{name.replace('.', '/')}.py" for name in names)
+
+    makers = {Path(str(file)) for file in MADE_BY}
+    needed = {name for maker in makers for name in imported(maker) if (ROOT / name).is_file()}
+    assert needed - {str(maker.relative_to(ROOT)) for maker in makers} == NO_MAKERS
