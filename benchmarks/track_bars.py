@@ -54,6 +54,16 @@ class Bar:
         """Whether a value reaches the limit."""
         return value >= self.limit if self.at_least else value <= self.limit
 
+    def answer(self, value: float) -> str:
+        """A value's yes or no."""
+        return "yes" if self.holds(value) else "no"
+
+    def by_group(self, rows: list[Row]) -> str:
+        """The same of each group alone: a mean hides films behind the lower bounds of noisy landmarks."""
+        values = {group: self.reached([row for row in rows if row.group == group]) for group in self.groups}
+        told = (f"{group} {v:.3f} {self.answer(v)}" for group, v in values.items() if np.isfinite(v))
+        return ", ".join(told)
+
 
 BARS = (
     Bar("in model: face vertices after one scale, mm", INSIDE, "face_scaled_mm", 1.0),
@@ -99,14 +109,17 @@ def last_stages(rows: list[Row]) -> list[Row]:
 
 
 def print_bars(rows: list[Row], say: Callable[[str], None] = print) -> None:
-    """One line a limit: wanted, reached, and whether; then what each further stage changes."""
+    """One line a limit: wanted, reached, and whether, also by group; then what each further stage changes."""
+    last = last_stages(rows)
     say(f"\n{'wanted, after the last stage, mean over clips (worst: *)':58s} {'limit':>8s} {'reached':>9s}")
     for bar in BARS:
-        value = bar.reached(last_stages(rows))
+        value = bar.reached(last)
         if np.isfinite(value):
-            sign, answer = ">=" if bar.at_least else "<=", "yes" if bar.holds(value) else "no"
-            name = bar.name + (" *" if bar.worst else "")
-            say(f"{name:58s} {sign}{bar.limit:6.4g} {value:9.3f}  {answer}")
+            sign, name = ">=" if bar.at_least else "<=", bar.name + (" *" if bar.worst else "")
+            say(
+                f"{name:58s} {sign}{bar.limit:6.4g} {value:9.3f}  "
+                f"{bar.answer(value) + ':':4s} {bar.by_group(last)}"
+            )
     for error in PHOTOMETRIC:
         _print_gain(rows, error, say)
 

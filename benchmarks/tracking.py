@@ -6,7 +6,8 @@ own       films of heads that the model cannot imitate (benchmarks/rendered_head
 shared    rendered scan heads of the shared data ($PERSONALIZE_SHARED), where it is at hand
 
 Films go through the pipeline's own stages: usable frames, landmarks, camera, fit. NAMEs (`hand`, `person1`) choose
-clips; for a VIDEO only consistency can be told. At the end: the numbers wanted, and whether they are reached.
+clips; for a VIDEO only consistency can be told. At the end: the numbers wanted, and whether they are reached,
+in all and by group.
 
 surf, mean      distance of the neutral face from the true surface after one similarity; of the mean head's, mm
 face, rigid     face vertices, neutral and motion, after one similarity a clip and after one rigid transform, mm

@@ -1,6 +1,7 @@
 """The limits: means and worst values over clips, the last stage's row, gains, and clips that get worse."""
 
 import numpy as np
+import pytest
 
 from benchmarks.track_bars import BARS, Bar, Row, last_stages, print_bars
 
@@ -54,11 +55,24 @@ def test_frames_lost_on_one_clip_are_not_averaged_away() -> None:
     assert bar.reached([kept] * 9 + [lost]) == 1.4 and not bar.holds(1.4) and bar.holds(0.7)
 
 
+def test_a_mean_does_not_hide_the_film_behind_lower_bounds() -> None:
+    def row(group: str, clip: str, lips: float) -> Row:
+        return Row(group, clip, "refined", {"lip_motion_mm": lips, "lip_motion_truth": 1.5})
+
+    clips = [row("person", "a", 0.2), row("person", "b", 0.3), row("inside", "c", 0.7)]
+    (bar,) = (bar for bar in BARS if bar.name.startswith("in model: lip motion"))
+    assert bar.reached(clips) == pytest.approx(0.4) and bar.answer(bar.reached(clips)) == "yes"
+    assert bar.by_group(clips) == "person 0.250 yes, inside 0.700 no"
+    assert bar.by_group(clips[:2]) == "person 0.250 yes"
+
+
 def test_printed_answers() -> None:
     lines: list[str] = []
     print_bars(rows(), lines.append)
     answer = {line.split(",")[0].split(" lowered")[0]: line for line in lines if line.strip()}
-    assert answer["out of model: surface against the mean head's"].endswith("yes")
+    assert answer["out of model: surface against the mean head's"].endswith(
+        "  yes: own 50.000 yes, shared 50.000 yes"
+    )
     assert answer["opening_centred_mm"].endswith("yes") and " 40.0 " in answer["opening_centred_mm"]
     assert answer["rotation_deg"].endswith("no; raised on a")
     assert not any("still face" in line for line in lines)
