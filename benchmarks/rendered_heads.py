@@ -28,6 +28,7 @@ TURN_S, TURN_BACK_S, TURN_RISE_S = (
     2.74,
     0.2,
 )  # of the fast head turn: when, when back, how long each takes
+CUT_S = 2.0
 LIP_ROLL = 0.4  # of the demo's: lower lips on real film hardly roll in, not at /f v/ either
 Colour = tuple[float, float, float]
 
@@ -50,6 +51,8 @@ class Scene:
     head: float = 0.8
     """Range of head movement; 1 turns by up to 17 degrees to either side."""
     fast_turn_deg: float = 0.0
+    shot_s: float = np.inf
+    """After so long there is a cut: CUT_S of what happens are not filmed."""
     speaks: bool = True
     """False: nothing moves."""
     speech_start_s: float = 0.0
@@ -108,6 +111,9 @@ SCENES = (
         ambient=0.55,
     ),
     Scene("fast_turn", 17, focal=2.4, head=0.5, fast_turn_deg=38.0, speech_start_s=31.0, shutter=0.5),
+    Scene(
+        "long", 18, 24.0, focal=1.4, head=0.9, shot_s=10.0, skin=(0.86, 0.80, 0.76), key_light=(30.0, 30.0)
+    ),
 )
 
 
@@ -168,9 +174,9 @@ def scene_motion(scene: Scene) -> TalkerMotion:
     """How the person of a scene moves: the demo's speech from the scene's start on, blinks, gaze, head."""
     style = replace(Style.random(scene.seed), head=scene.head)
     distance = scene.focal * max(scene.size) / scene.face_px_per_m + FACE_DEPTH_M
-    motion = talker_motion(
-        _phones(scene.speech_start_s), scene.seconds, FPS, scene.seed, style, None, distance
-    )
+    filmed = scene.seconds + CUT_S * (scene.seconds // scene.shot_s)
+    motion = talker_motion(_phones(scene.speech_start_s), filmed, FPS, scene.seed, style, None, distance)
+    motion = _cut(motion, scene.shot_s)
     rolled = motion.expression.copy()
     rolled[:, motion.names.index("mouthRollLower")] *= LIP_ROLL
     motion = replace(motion, expression=rolled)
@@ -188,6 +194,13 @@ def scene_motion(scene: Scene) -> TalkerMotion:
 def _phones(start: float) -> list[Phone]:
     phones = load_phones(SPEECH)
     return [Phone(p.name, p.start - start, p.end - start) for p in phones if p.end > start]
+
+
+def _cut(motion: TalkerMotion, shot_s: float) -> TalkerMotion:
+    """The motion without the last CUT_S of each shot_s + CUT_S."""
+    kept = np.arange(len(motion.expression)) / FPS % (shot_s + CUT_S) < shot_s
+    names = ("expression", "rotation", "translation", "eyes")
+    return replace(motion, **{name: getattr(motion, name)[kept] for name in names})
 
 
 def _there_and_back(frames: int) -> F64:

@@ -23,6 +23,7 @@ from personalize.shots import (
     Frames,
     difference,
     find_shots,
+    repeated,
     usable_seconds,
 )
 from personalize.sound import on_video_clock, read_audio
@@ -99,7 +100,7 @@ def _read_sound(media: MediaInfo) -> tuple[NDArray[np.float32], float]:
 
 def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, list[str]]:
     """Frames of a video with their reasons, and warnings. Two passes: shots first, then faces."""
-    time, change, same, corrupt = _look_for_cuts(media, progress)
+    time, change, again, corrupt = _look_for_cuts(media, progress)
     segment = find_shots(time, change)
     mine, others = main_person(_follow_faces(media, segment, progress))
     _check_upright(media, mine)
@@ -121,7 +122,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
         "too_dark": seen & (light < MIN_LIGHT),
         "too_small": seen & (eyes < MIN_EYES_PX),
         "cut": seen & _cut(time, segment),
-        "duplicate": same & seen,
+        "duplicate": again & seen,
         "corrupt": corrupt,
     }
     for name, marked in marks.items():  # the last that applies stays
@@ -151,13 +152,13 @@ def _look_for_cuts(
     last: NDArray[np.uint8] | None = None
     for time, rgb in reader:
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        change, repeated = difference(grey, last) if last is not None else (0.0, False)
-        rows.append((time, change, repeated, reader.damaged))
+        change, equal = difference(grey, last) if last is not None else (0.0, False)
+        rows.append((time, change, equal, reader.damaged))
         last = grey
         if progress is not None:
             progress(min(len(rows), expected), 2 * expected)
     times, changes, same, damaged = zip(*rows)
-    return np.array(times), np.array(changes), np.array(same), np.array(damaged)
+    return np.array(times), np.array(changes), repeated(np.array(changes), np.array(same)), np.array(damaged)
 
 
 def _follow_faces(media: MediaInfo, segment: NDArray[np.int32], progress: Progress) -> list[Tracklet]:

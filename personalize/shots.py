@@ -24,6 +24,8 @@ MIN_SHOT_S = 0.5  # shorter shots are left out: too little to track
 # A cut changes the picture by so much (grey levels, mean) and so many times more than its neighbours in time.
 CUT_LEVEL, CUT_RATIO, CUT_WINDOW_S = 1.5, 1.9, 0.28
 SAME_LEVEL = 1.0  # grey levels: no pixel of the thumbnail changes by more in a repeated picture
+# One that was coded anew changes by less than this (mean), and by so small a share of what pictures around it do.
+CODED_LEVEL, CODED_SHARE = 0.3, 0.15
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -49,9 +51,20 @@ class Frames:
 
 
 def difference(grey: U8, last: U8) -> tuple[float, bool]:
-    """How a grey picture [h, w] differs from the one before: (mean grey levels, whether it is repeated)."""
+    """How a grey picture [h, w] differs from the one before: (mean grey levels, whether it is the same)."""
     change = np.abs(grey.astype(np.int16) - last)
     return float(change.mean()), bool(change.max() <= SAME_LEVEL)
+
+
+def repeated(change: F64, same: Bool) -> Bool:
+    """[T] pictures that repeat the one before: those that are the `same`, and those coded as if they were new ones.
+
+    change: [T], see `difference`. Of film at 24 pictures a second in a file of 30 every fifth does. Where nothing moves
+    all change as little, and none is left out.
+    """
+    padded = np.pad(change, 2)
+    before, after = np.maximum(padded[1:-3], padded[:-4]), np.maximum(padded[3:-1], padded[4:])
+    return same | ((change < CODED_LEVEL) & (change < CODED_SHARE * np.minimum(before, after)))
 
 
 def find_shots(time: F64, change: F64) -> NDArray[np.int32]:

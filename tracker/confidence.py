@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from tracker.occlusion import Appearance
 from tracker.track import F32, F64, Track
@@ -29,7 +29,7 @@ def confidence(
     """[T] 0..1 from the landmarks alone, 0 where nothing was measured.
 
     error: [n, L] distance of fitted and observed landmarks, in any unit proportional to the face.
-    visible: [n, L]. presence: [n], the landmarker's. good: [n] the measured frames of `total`.
+    visible: [n, L], as the pose tells. presence: [n], the landmarker's. good: [n] the measured frames of `total`.
     A frame loses confidence by a residual above the clip's own median, by one that jumps from its
     neighbours', by a hidden side, and by presence.
     """
@@ -80,6 +80,6 @@ def _factor(value: NDArray[np.floating], free: float, half: float) -> F64:
 
 def off_axis_deg(track: Track) -> F64:
     """[T] angle between the face's axis and the line from the head to the camera, degrees."""
-    axes = np.stack([cv2.Rodrigues(row.astype(np.float64))[0][:, 2] for row in track.rotation])
+    axes = (Rotation.from_rotvec(track.rotation) * Rotation.from_rotvec(track.neck)).as_matrix()[:, :, 2]
     sight = -track.translation / np.linalg.norm(track.translation, axis=1, keepdims=True)
     return np.degrees(np.arccos(np.clip((axes * sight).sum(1), -1.0, 1.0)))

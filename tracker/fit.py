@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 MIN_PRESENCE = 0.5
 LEAST_EVIDENCE = 0.02  # of a covered frame: enough to hold a pose where no neighbour does
 LIP_BIAS = 0.001  # m
+MISSING = 2.5  # times the usual time between measured frames: with one or two missing, the next still follows
 
 Frames = NDArray[np.int64]
 
@@ -73,7 +74,7 @@ def fit_track(
     smoothness = smoothness_between(energy, landmarks.time, good, segment)
     x, _ = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
     if camera.method != "prior":
-        x = hold_poses(x, bundle, good, runs(good, segment), sound, 1.0)
+        x = hold_poses(x, bundle, good, runs(good, segment, landmarks.time), sound, 1.0)
     return make_track(landmarks, camera, head, energy, observed, identity, x, good)
 
 
@@ -169,9 +170,14 @@ def fit_identity(energy: Energy, start: F64, keys: tuple[Frames, Frames]) -> F64
     return solve_subject(chosen, np.zeros(len(energy.model.identity)), start[frames]).identity
 
 
-def runs(good: Frames, segment: NDArray[np.int32]) -> NDArray[np.int64]:
-    """[n] a number for each stretch of measured frames that follow each other within one shot."""
-    broken = (np.diff(good) != 1) | (np.diff(segment[good]) != 0)
+def runs(good: Frames, segment: NDArray[np.int32], time: F64) -> NDArray[np.int64]:
+    """[n] a number for each stretch of measured frames that follow each other within one shot.
+
+    time: [T] s. Pictures that are repeated are not measured, and break nothing.
+    """
+    step = np.diff(time[good])
+    far = step > MISSING * np.median(step) if len(step) else np.zeros(0, bool)
+    broken = far | (np.diff(segment[good]) != 0)
     return np.concatenate([[0], np.cumsum(broken)])
 
 
@@ -186,7 +192,7 @@ def smoothness_between(
     factor = np.ones(len(sd)) if factor is None else factor
     precision = factor / (sd * (interval / 0.04) ** 1.5) ** 2
     tolerated = float(factor[-1]) * energy.weights.jerk**2
-    return Smoothness.between(runs(good, segment), precision, tolerated)
+    return Smoothness.between(runs(good, segment, time), precision, tolerated)
 
 
 def resume(
@@ -239,12 +245,12 @@ def make_track(
     valid = np.zeros(total, bool)
     valid[good] = True
     eyes = eye_rotations(head, identity, expression, x, observed, energy)
+    # By the pose alone: what covers a face is judged by the pictures.
+    seen = visibility(energy.model, x[:, -6:-3], x[:, -3:])
     return Track(
         time=landmarks.time,
         valid=valid,
-        confidence=confidence(
-            error / energy.px_per_m[:, None], energy.visible, landmarks.presence[good], good, total
-        ),
+        confidence=confidence(error / energy.px_per_m[:, None], seen, landmarks.presence[good], good, total),
         identity=identity.astype(np.float32),
         expression=expression[nearest],
         jaw=jaw[nearest],

@@ -81,7 +81,7 @@ def refine_track(
     held, cuts, colours = _looked_at(subject, lines, camera, frames, good, {*usual, *rest, *other})
     if not held:
         return Refined(track, unknown)
-    widths = _read_widths(lines, colours, good, segment, sound)
+    widths = _read_widths(lines, colours, good, segment, landmarks.time, sound)
     opened = lines.opened(observed, lines.widths(_fitted(subject, observed, x)) if widths is None else widths)
     subject = _with_landmarks(subject, opened, x, sound)
     identity = fit_identity_to_skin(subject, held, (rest, other), x)
@@ -90,7 +90,7 @@ def refine_track(
         smoothness = smoothness_between(subject.energy, landmarks.time, good, segment)
         x = fit_landmarks(subject, x, smoothness)
         if camera.method != "prior":
-            x = hold_poses(x, bundle, good, runs(good, segment), sound, 1.0)
+            x = hold_poses(x, bundle, good, runs(good, segment, landmarks.time), sound, 1.0)
     rows = np.array([row for row in held if row in usual])
     levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
@@ -108,18 +108,18 @@ def refine_track(
         if progress:
             progress(min(start + STRETCH, len(good)), len(good))
     if camera.method != "prior":
-        refined = hold_poses(refined, bundle, good, runs(good, segment), sound, HALFWAY)
+        refined = hold_poses(refined, bundle, good, runs(good, segment, landmarks.time), sound, HALFWAY)
     out = make_track(landmarks, camera, head, subject.energy, opened, identity, refined, good)
     return Refined(out, _relative(deviation, good, len(track.time)))
 
 
 def _read_widths(
-    lines: LipLines, colours: dict[int, U8], good: Index, segment: NDArray[np.int32], sound: Index
+    lines: LipLines, colours: dict[int, U8], good: Index, segment: NDArray[np.int32], time: F64, sound: Index
 ) -> F64 | None:
     """[n, Q] mm between the lips, of the colours along the lines by rows; None where they do not tell it.
 
     Rows without colours keep the landmarks' widths, and lips are not followed across them. good: [n], the rows' frames.
-    segment: [T], number of the uninterrupted shot. sound: rows that are believed.
+    segment: [T], number of the uninterrupted shot. time: [T] s. sound: rows that are believed.
     """
     rows, along = np.array(list(colours)), np.stack(list(colours.values()))
     bare = np.isin(rows, sound)
@@ -127,7 +127,7 @@ def _read_widths(
     if edges is None:
         return None
     widths = lines.marks[..., 2] - lines.marks[..., 1]
-    widths[rows] = steadied(edges, along, np.where(bare, runs(good[rows], segment), -1))
+    widths[rows] = steadied(edges, along, np.where(bare, runs(good[rows], segment, time), -1))
     return widths
 
 

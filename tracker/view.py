@@ -16,6 +16,7 @@ U8 = NDArray[np.uint8]
 Index = NDArray[np.int64]
 Rows = slice | Sequence[int] | Index
 
+LARGEST = 2.0  # times the usual face: all windows are as large, and for a frame or two memory is not to grow
 MARGIN = 1.15  # of the extent of the face's landmarks
 
 
@@ -32,10 +33,14 @@ class Window:
 
     @classmethod
     def around(cls, observed: F64, px_per_m: F64, finest_px_per_m: float) -> Window:
-        """Windows of one size around landmarks [n, L, 2] px, shrunk to `finest_px_per_m` in the clip's median."""
+        """Windows of one size around landmarks [n, L, 2] px, shrunk to `finest_px_per_m` in the clip's median.
+
+        They hold the largest face, but for one that is more than LARGEST times the usual.
+        """
         low, high = observed.min(1), observed.max(1)
         scale = min(1.0, finest_px_per_m / float(np.median(px_per_m)))
-        size = np.ceil((high - low).max(0) * MARGIN * scale).astype(int)
+        extent = np.minimum((high - low).max(0), LARGEST * np.median(high - low, axis=0))
+        size = np.ceil(extent * MARGIN * scale).astype(int)
         origin = np.floor((low + high) / 2 - size / scale / 2)
         return cls(origin, scale, (int(size[0]), int(size[1])))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.rendered_heads import SCENES, Scene, scene_motion, stranger
+from benchmarks.rendered_heads import CUT_S, FPS, SCENES, Scene, scene_motion, stranger
 from tracker.head import HeadModel, load_head
 
 SCENE = Scene("any", 3, seconds=2.0)
@@ -66,3 +66,16 @@ def test_fast_turn_is_fast_and_comes_back() -> None:
     angle = np.degrees((turns * turns[0].inv()).magnitude())
     assert angle.max() == pytest.approx(30, abs=0.1) and angle[-1] < 0.1
     assert np.abs(np.diff(angle)).max() > 5
+
+
+def test_a_cut_leaves_out_what_happens_meanwhile() -> None:
+    scene = next(scene for scene in SCENES if np.isfinite(scene.shot_s))
+    cut, whole = (
+        scene_motion(scene),
+        scene_motion(replace(scene, shot_s=np.inf, seconds=scene.seconds + CUT_S)),
+    )
+    first, missing = round(scene.shot_s * FPS), round(CUT_S * FPS)
+    assert len(cut.expression) == round(scene.seconds * FPS)
+    moved = np.abs(np.diff(cut.translation, axis=0)).max(1)
+    assert moved[first - 1] > 5 * np.median(moved) and moved[2 * first - 1] > 5 * np.median(moved)
+    assert len(whole.expression) == len(cut.expression) + missing

@@ -12,7 +12,7 @@ from personalize.container import probe
 from personalize.errors import UserError
 from personalize.ingest import MIN_USABLE_S, find_usable, ingest_video
 from personalize.people import Tracklet, main_person
-from personalize.shots import REASONS, Frames, difference, find_shots, usable_seconds
+from personalize.shots import REASONS, Frames, difference, find_shots, repeated, usable_seconds
 from personalize.split import make_split
 from tests.personalize.video_factory import RATE, clicks, moving, write_video
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
@@ -49,6 +49,19 @@ def test_a_repeated_picture_is_seen_and_a_small_motion_is_not_one() -> None:
     moved = grey.copy()
     moved[10:12, 10:12] ^= 8
     assert difference(grey, grey)[1] and not difference(moved, grey)[1]
+
+
+@pytest.mark.parametrize("every", [2, 5])
+def test_pictures_that_are_repeated_and_coded_anew_are_seen(every: int) -> None:
+    random = np.random.default_rng(0)
+    change = random.uniform(0.6, 1.4, 200)
+    again = np.arange(200) % every == every - 1
+    change[again] = random.uniform(0.02, 0.08, again.sum())
+    nothing = np.zeros(200, bool)
+    np.testing.assert_array_equal(repeated(change, nothing)[2:-2], again[2:-2])
+    still = random.uniform(0.02, 0.08, 200)
+    assert not repeated(still, nothing).any()
+    assert repeated(still, again).sum() == again.sum()
 
 
 def test_usable_time_bridges_repeated_frames_but_not_cuts() -> None:

@@ -62,3 +62,8 @@ def test_a_face_at_the_side_of_the_picture_that_looks_at_the_camera_is_not_turne
     aside = np.tile(np.float32([0.6, 0, 0.6]), (4, 1))
     looking = np.tile(turn(45), (4, 1))
     assert off_axis_deg(replace(track, translation=aside, rotation=looking)) == pytest.approx(0, abs=0.05)
+
+
+def test_a_head_that_its_neck_turns_is_turned_away(track):
+    turned = replace(track, neck=np.tile(np.radians([0.0, 60.0, 0.0]).astype(np.float32), (4, 1)))
+    assert off_axis_deg(turned) == pytest.approx(off_axis_deg(track) + 60, abs=3)

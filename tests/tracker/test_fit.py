@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tracker.energy import LIP_PAIRS, Weights, landmark_model
-from tracker.fit import fit_track, resume, with_lips_shut
+from tracker.fit import fit_track, make_track, resume, runs, with_lips_shut
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, INNER_LIP_LOWER, POINTS
 from tracker.modes import LIP_SHAPES
@@ -436,3 +436,22 @@ def test_poses_are_the_bundles_unless_the_focal_length_is_the_priors(talker, tra
     found = fit_track(talker.landmarks, camera, bundle, HEAD, *everything)
     swing, free = swing_deg(found, talker.rotation), swing_deg(track, talker.rotation)
     assert swing < 0.5 * free if held else swing == pytest.approx(free, rel=1e-6)
+
+
+def test_repeated_pictures_break_no_stretch_and_missing_ones_do():
+    time, one_shot = np.arange(60) / 30, np.zeros(60, np.int32)
+    fifths = np.flatnonzero(np.arange(60) % 5 < 4)
+    assert runs(fifths, one_shot, time).max() == 0
+    halves = np.flatnonzero(np.arange(60) % 2 == 0)
+    assert runs(halves, one_shot, time).max() == 0
+    gap = np.setdiff1d(np.arange(60), [20, 21, 22])
+    assert runs(gap, one_shot, time).tolist() == [0] * 20 + [1] * 37
+    assert runs(halves, (np.arange(60) >= 30).astype(np.int32), time).tolist() == [0] * 15 + [1] * 15
+
+
+def test_what_covers_a_face_is_no_doubt_of_the_fit(talker, track):
+    """It is judged by the pictures; counted here too, refined frames had been left out for half of it."""
+    covered = np.full(len(track.time), 0.6, np.float32)
+    energy, x, observed, good = resume(track, talker.landmarks, CAMERA, HEAD, covered)
+    again = make_track(talker.landmarks, CAMERA, HEAD, energy, observed, track.identity, x, good)
+    np.testing.assert_allclose(again.confidence, track.confidence, atol=0.05)

@@ -170,7 +170,8 @@ def test_lips_are_not_followed_across_pictures_that_are_missing(film: Film, monk
     monkeypatch.setattr(
         refine, "steadied", lambda edges, along, run: told.append(run) or np.ones((len(run), 9))
     )
-    widths = _read_widths(lines, colours, good, np.zeros(FRAMES, np.int32), np.arange(1, FRAMES))
+    one_shot, time = np.zeros(FRAMES, np.int32), film.landmarks.time
+    widths = _read_widths(lines, colours, good, one_shot, time, np.arange(1, FRAMES))
     assert widths is not None
     np.testing.assert_array_equal(told[0], [-1, *[0] * 7, *[1] * (FRAMES - 10)])
     np.testing.assert_allclose(widths[[8, 9]], lines.widths(observed)[[8, 9]])
