@@ -20,7 +20,7 @@ def run(
     ] = None,
     iterations: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = Settings.iterations,
     seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = Settings.seed,
-    focal: Annotated[float | None, typer.Option(min=1, help="Focal length in pixels, if known.")] = None,
+    focal: Annotated[float | None, typer.Option(help="Focal length in pixels (not mm), if known.")] = None,
     distortion: Annotated[
         str | None,
         typer.Option(

@@ -12,7 +12,7 @@ from personalize.heads import run_head
 from personalize.overlay import check_modes
 from personalize.reporter import Reporter
 from personalize.run import RunFolder
-from personalize.settings import Settings
+from personalize.settings import Settings, check_focal
 from personalize.stage import Context, Stage, run_stages
 from personalize.stages import (
     CameraStage,
@@ -63,7 +63,8 @@ def personalize_video(
     out: the run folder, by default the video's name + `.personalize` in the working folder.
     Raises UserError for whatever the user can mend.
     """
-    probe(video)
+    media = probe(video)
+    check_focal(settings.focal_px, (media.width, media.height))
     check_modes(settings.overlay)
     try:
         # Asked now, not after the tracking.

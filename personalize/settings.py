@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from personalize.errors import UserError
+
+# Of the picture's longer side. Beyond lie fisheyes and telescopes, and focal lengths that are in mm.
+FOCAL_RANGE = (0.3, 10.0)
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -35,3 +40,13 @@ class Settings:
     tracked: str | None = None
     overlay: tuple[str, ...] = ("wireframe",)
     min_confidence: float = 0.5
+
+
+def check_focal(focal_px: float | None, size: tuple[int, int]) -> None:
+    """Raises UserError for a focal length that pictures of this size, (width, height) px, are hardly taken with."""
+    low, high = (bound * max(size) for bound in FOCAL_RANGE)
+    if focal_px is not None and not low <= focal_px <= high:  # nor is a NaN between them
+        raise UserError(
+            f"--focal {focal_px:g}: it is wanted in pixels, not mm; for this video of {size[0]}x{size[1]} px give "
+            f"one between {low:.0f} and {high:.0f}, or leave it out and it is estimated"
+        )

@@ -41,6 +41,8 @@ class Crop:
         low, high = np.array(self.origin), np.array(self.origin) + self.extent
         limit = np.array(rgb.shape[1::-1])
         first, last = np.clip(low, 0, limit), np.clip(high, 0, limit)
+        if (first == last).any():
+            return np.full((*self.size[::-1], 3), OUTSIDE, np.uint8)
         part = rgb[first[1] : last[1], first[0] : last[0]]
         if (missing := np.concatenate([first - low, high - last])).any():
             left, top, right, bottom = missing.tolist()

@@ -62,7 +62,7 @@ def test_wrong_options_get_one_line(tmp_path: Path) -> None:
     assert_refused(personalize(*edit, "--rule", "euler", cwd=tmp_path), "rule")
 
 
-def test_an_encoder_a_device_or_a_mode_that_is_not_there_gets_one_line_before_any_work(
+def test_an_encoder_a_device_a_focal_length_or_a_mode_that_is_not_there_gets_one_line_before_any_work(
     tmp_path: Path,
 ) -> None:
     video, speech = tmp_path / "talk.mkv", tmp_path / "speech.wav"
@@ -72,6 +72,7 @@ def test_an_encoder_a_device_or_a_mode_that_is_not_there_gets_one_line_before_an
     assert_refused(personalize("run", video, "--device", "abacus", cwd=tmp_path), "abacus", "cpu")
     assert_refused(personalize("run", video, "--distortion", "-0.2", cwd=tmp_path), "--distortion", "--focal")
     assert_refused(personalize("run", video, "--distortion", "-0.2,much", cwd=tmp_path), "-0.2,much")
+    assert_refused(personalize("run", video, "--focal", "inf", cwd=tmp_path), "--focal inf", "96x64 px")
     assert_refused(personalize("run", video, "--overlay", "shaded,wire", cwd=tmp_path), "wire:", "wireframe")
     subject = ("--subject", BASE_CHECKPOINT)
     assert_refused(personalize("animate", speech, *subject, "--encoder", "nowhere", cwd=tmp_path), "nowhere")

@@ -46,6 +46,12 @@ def test_a_crop_maps_points_as_it_maps_the_picture() -> None:
         np.testing.assert_allclose(middle, crop.place(np.array([41.5, 31.5])), atol=0.05)
 
 
+@pytest.mark.parametrize("origin", [(80, 0), (-40, 0), (0, 300), (0, -40), (10**6, -(10**6))])
+def test_a_crop_that_lies_beside_the_picture_is_dark(origin: tuple[int, int]) -> None:
+    shown = Crop(origin, (40, 40), (50, 30)).picture(np.full((60, 80, 3), 255, np.uint8))
+    assert shown.shape == (30, 50, 3) and (shown == OUTSIDE).all()
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_each_mode_draws_on_the_face_and_nowhere_else(
     mode: str, scenes: list[Scene], head: HeadModel
