@@ -36,6 +36,7 @@ Progress = Callable[[int, int], None] | None
 SEARCH_SIDE = 960  # px: faces are looked for in pictures of at most this size
 MIN_USABLE_S = 10.0  # less is refused: fine-tuned on 5 s the model diverges
 GOOD_USABLE_S = 30.0  # less gives a warning
+MIN_RATE = 8.0  # different pictures a second; with fewer lips shut and open between two of them unseen
 MIN_EYES_PX = 20.0  # between the eyes; below, lip motion is lost in the landmarks' jitter
 GOOD_EYES_PX = 45.0
 MIN_LIGHT, GOOD_LIGHT = 15.0, 35.0  # mean grey level of the face
@@ -70,8 +71,8 @@ class Ingested:
 def ingest_video(path: Path | str, progress: Progress = None) -> Ingested:
     """Look through a video: times, usable frames, sound, split.
 
-    Raises UserError when the file is no video, has no sound or silence only, lies on its side, or has
-    under 10 s of one usable face.
+    Raises UserError when the file is no video, has no sound or silence only, too few pictures a second, lies on its
+    side, or has under 10 s of one usable face.
     """
     media = probe(path)
     audio = _read_sound(media)
@@ -101,6 +102,7 @@ def _read_sound(media: MediaInfo) -> tuple[NDArray[np.float32], float]:
 def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, list[str]]:
     """Frames of a video with their reasons, and warnings. Two passes: shots first, then faces."""
     time, change, again, corrupt = _look_for_cuts(media, progress)
+    _check_rate(media, time[~again])
     segment = find_shots(time, change)
     mine, others = main_person(_follow_faces(media, segment, progress))
     _check_upright(media, mine)
@@ -129,6 +131,18 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
         reason[marked] = REASONS.index(name)
     frames = Frames(time, reason == 0, reason, REASONS, segment, box.astype(np.float32))
     return frames, _lost_in_file(media, time) + _warnings(frames, eyes, light)
+
+
+def _check_rate(media: MediaInfo, changed: NDArray[np.float64]) -> None:
+    """Raise UserError when the picture changes, at the times `changed` [n] s, too rarely to learn speech from it."""
+    if len(changed) < 2:
+        return  # it stands still, which is another complaint
+    rate = round(1 / float(np.median(np.diff(changed))), 1)
+    if rate < MIN_RATE:
+        raise UserError(
+            f"{media.path}: only {rate:.1f} different pictures a second, which miss how lips move; at least "
+            f"{MIN_RATE:.0f} are needed: record it again, best at 24 or more"
+        )
 
 
 def _check_upright(media: MediaInfo, person: list[Tracklet]) -> None:

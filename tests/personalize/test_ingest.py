@@ -164,6 +164,25 @@ def test_a_face_that_lies_on_its_side_is_refused(
         assert find_usable(probe(path))[0].usable.any()
 
 
+@pytest.mark.parametrize(
+    ("fps", "repeats", "said"), [(4, 1, "4.0"), (6, 1, "6.0"), (25, 5, "5.0"), (8, 1, ""), (25, 2, "")]
+)
+def test_too_few_pictures_a_second_are_refused_before_faces_are_looked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fps: int, repeats: int, said: str
+) -> None:
+    pictures = [picture for picture in moving(24) for _ in range(repeats)]
+    path = write_video(tmp_path / "slow.mkv", pictures, [i / fps for i in range(len(pictures))])
+    looked: list[str] = []
+    monkeypatch.setattr("personalize.ingest._follow_faces", lambda media, *_: looked.append(media.path) or [])
+    if said:
+        with pytest.raises(UserError, match=rf"^{path}: only {said} different pictures a second") as caught:
+            find_usable(probe(path))
+        assert "\n" not in str(caught.value)
+    else:
+        find_usable(probe(path))
+    assert bool(looked) != bool(said)
+
+
 def test_what_the_file_lost_is_said(tmp_path: Path) -> None:
     path = write_video(tmp_path / "gap.mkv", moving(20), [i / 25 + (i >= 10) for i in range(20)])
     _, warnings = find_usable(probe(path))
