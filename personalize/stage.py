@@ -43,7 +43,7 @@ class Stage(ABC):
     reads: names of the settings used.
     needs: files of the run folder used, relative to it; `video` is the video itself.
     makes: files made, relative to the stage's folder. products: files moved to the top of the run folder.
-    resumes: the partial folder of an interrupted run with the same key is kept and continued.
+    resumes: the partial folder of an interrupted run with the same key is continued.
     """
 
     name: ClassVar[str]
@@ -109,7 +109,7 @@ def run_stage(stage: Stage, context: Context, *, force: bool = False) -> bool:
         return False
     started = time.monotonic()
     with report.stage(stage.name):
-        partial = _open_partial(stage, key, run.path, keep=not force)
+        partial = _open_partial(stage, key, run.path, force)
         stage.make(context, partial)
         _publish(stage, partial, run.path)
     run.record(stage.name, _entry(stage, key, time.monotonic() - started, run.path))
@@ -139,15 +139,19 @@ def run_stages(
             break
 
 
-def _open_partial(stage: Stage, key: str, root: Path, *, keep: bool) -> Path:
-    """The folder to work in: empty, or what an interrupted run of the same key left."""
+def _open_partial(stage: Stage, key: str, root: Path, force: bool) -> Path:
+    """The folder to work in: empty, or what an interrupted run of the same key left.
+
+    A forced run begins anew once: interrupted, it is continued, by the same command too.
+    """
     partial = root / f".{stage.folder}.partial"
     key_file = partial / "key"
-    same = key_file.is_file() and key_file.read_text() == key
-    if not (stage.resumes and keep and same):
+    begun = key_file.read_text() if key_file.is_file() else ""
+    forced = f"{key} forced"
+    if not (stage.resumes and begun in ([forced] if force else [key, forced])):
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
-        write_text(key_file, key)
+        write_text(key_file, forced if force else key)
     return partial
 
 

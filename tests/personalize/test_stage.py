@@ -6,6 +6,8 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
@@ -140,6 +142,46 @@ def test_killed_stage_is_not_taken_for_finished_and_continues(context: Context) 
     steps = (context.run.path / "crawl/steps.txt").read_text().split()
     assert [int(step.split("@")[0]) for step in steps] == list(range(10))
     assert len({step.split("@")[1] for step in steps}) == 2
+
+
+@pytest.fixture
+def crawl(context: Context, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """How many steps one command makes, which is interrupted in step `stop`."""
+
+    def made(stop: int | None = None, **options: str) -> int:
+        slept: list[float] = []
+
+        def sleep(seconds: float) -> None:
+            slept.append(seconds)
+            if len(slept) == stop:
+                raise KeyboardInterrupt
+
+        monkeypatch.setattr(time, "sleep", sleep)
+        with suppress(KeyboardInterrupt):
+            run_stages((Crawl(),), context, **options)
+        return len(slept)
+
+    return made
+
+
+@pytest.mark.parametrize("option", ["force", "first"])
+def test_an_interrupted_forced_stage_is_continued_by_the_same_command(
+    crawl: Callable[..., int], option: str
+) -> None:
+    forced = {option: "crawl"}
+    assert crawl() == 10
+    assert crawl(**forced, stop=4) == 4, "what was finished is begun anew"
+    assert crawl(**forced, stop=3) == 3
+    assert crawl(**forced) == 3, "4 and 3 of 10 were made"
+    assert crawl() == 0
+    assert crawl(**forced) == 10
+
+
+def test_a_forced_stage_does_not_continue_what_it_was_not_forced_in(crawl: Callable[..., int]) -> None:
+    assert crawl(stop=4) == 4
+    assert crawl(force="crawl", stop=7) == 7
+    assert crawl(stop=1) == 1
+    assert crawl(force="crawl") == 2
 
 
 def test_another_process_is_refused(context: Context) -> None:
