@@ -54,7 +54,7 @@ def head_assets(settings: Settings) -> dict[str, str]:
 def read_flame(path: Path, embedding: Path) -> HeadModel:
     """FLAME from its pickle, a landmark embedding and, where it lies beside the pickle, FLAME_masks.pkl."""
     content = read_pickle(path)
-    arrays = {key: _dense(content[key]) for key in ARRAYS if key in content}
+    arrays = {key: _dense(path, key, content[key]) for key in ARRAYS if key in content}
     try:
         head = flame_head(path.stem, arrays, read_embedding(embedding), _masks(path.parent / MASKS))
     except TrackError as error:
@@ -77,7 +77,7 @@ def read_embedding(path: Path) -> SurfacePoints:
         points = SurfacePoints(
             landmarks.astype(np.int32).ravel(), triangles.astype(np.int32).ravel(), shares.astype(np.float32)
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"{path} is not a landmark embedding ({error}); give one of {', '.join(EMBEDDINGS)}"
         ) from error
@@ -97,14 +97,18 @@ def _files(settings: Settings) -> tuple[Path, Path]:
     )
 
 
-def _dense(value: Any) -> NDArray[Any]:
-    return value.toarray() if sparse.issparse(value) else np.asarray(value)
+def _dense(path: Path, name: str, value: Any) -> NDArray[Any]:
+    """An entry of a pickle as an array. Raises UserError for lists in it that are not equally long."""
+    try:
+        return value.toarray() if sparse.issparse(value) else np.asarray(value)
+    except ValueError as error:
+        raise UserError(f"{path}: {name} is no array ({error}); get the file again") from error
 
 
 def _masks(path: Path) -> dict[str, NDArray[np.int32]]:
     if not path.is_file():
         return {}
-    masks = {str(name): np.asarray(index).ravel() for name, index in read_pickle(path).items()}
+    masks = {str(name): _dense(path, name, index).ravel() for name, index in read_pickle(path).items()}
     for name, index in masks.items():
         if index.dtype.kind not in "iu":
             raise UserError(f"{path}: {name} is not a list of vertices; get the file again")

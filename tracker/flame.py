@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tracker.camera import rigid_landmarks
 from tracker.flame_regions import regions_of
 from tracker.head import HeadModel, Joint, LandmarkEmbedding
 from tracker.landmark_indices import IRIS_CENTRES, POINTS
@@ -20,7 +21,10 @@ IDENTITIES = 300  # of the columns of shapedirs; the others are expressions
 PARENTS = (-1, 0, 1, 1, 1)  # root, neck, jaw, left eye, right eye
 ARRAYS = ("v_template", "f", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights")
 JOINT_ROWS = {"neck": NECK, "jaw": JAW, "left_eye": LEFT_EYE, "right_eye": RIGHT_EYE}
+LARGEST = 1e6  # number in the arrays: vertices are fewer, everything else is far below
 CLAY = (205, 186, 174)
+# Landmarks of the rigid upper face tell the head's pose: how many, and how far off any one line they lie (rms).
+LEAST_RIGID, LEAST_BREADTH_M = 6, 0.005
 
 Arrays = Mapping[str, NDArray[np.generic]]
 
@@ -42,7 +46,8 @@ def flame_head(
     arrays: `v_template` [D, 3] m, `f` [F, 3], `shapedirs` [D, 3, 300 + Ke], `posedirs` [D, 3, 36],
     `J_regressor` [5, D], `kintree_table` [2, 5], `weights` [D, 5]. points: at least the inner lips. masks: FLAME's own
     vertex masks, empty where there are none; the regions are then told from the landmarks. Irises are added to the
-    landmarks. Raises TrackError for arrays that are missing, not finite, or do not fit each other.
+    landmarks. Raises TrackError for arrays that are missing, not finite, or do not fit each other, and for landmarks
+    that do not tell the head's pose.
     """
     checked = _checked(arrays)
     template, faces, weights = checked["v_template"], checked["f"].astype(np.int32), checked["weights"]
@@ -62,6 +67,7 @@ def flame_head(
     for key in ARRAYS:
         digest.update(np.ascontiguousarray(checked[key]).tobytes())
     embedding = _embedding(points, skeleton, template, faces, digest.hexdigest())
+    _check_rigid(embedding, template, faces)
     flipped = template * np.array([-1, 1, 1])
     return HeadModel(
         name=name,
@@ -87,8 +93,8 @@ def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
     if missing:
         raise TrackError(f"no FLAME model: {', '.join(missing)} is missing")
     try:
-        checked = {key: np.asarray(arrays[key], np.float64) for key in ARRAYS}
-    except (TypeError, ValueError) as error:
+        checked = {key: np.atleast_1d(np.asarray(arrays[key], np.float64)) for key in ARRAYS}
+    except (TypeError, ValueError, OverflowError) as error:
         raise TrackError(f"no FLAME model: arrays that are no numbers ({error})") from error
     vertices, triangles = len(checked["v_template"]), len(checked["f"])
     shapes = checked["shapedirs"].shape
@@ -105,10 +111,12 @@ def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
         "weights": (vertices, len(PARENTS)),
     }
     for key, shape in expected.items():
-        if checked[key].shape != shape or not np.isfinite(checked[key]).all():
+        if checked[key].shape != shape or not (np.abs(checked[key]) < LARGEST).all():  # NaN is not below it
             raise TrackError(
-                f"no FLAME model: {key} is {checked[key].shape}, finite numbers of {shape} needed"
+                f"no FLAME model: {key} is {checked[key].shape}, numbers below {LARGEST:.0e} of {shape} needed"
             )
+    if not vertices or not triangles:
+        raise TrackError(f"no FLAME model: it has {vertices} vertices and {triangles} faces")
     if modes <= IDENTITIES:
         raise TrackError(
             f"no FLAME model with expressions: shapedirs holds {modes} shapes, of which {IDENTITIES} are the identity's"
@@ -124,8 +132,8 @@ def _check_points(points: SurfacePoints, faces: int) -> None:
     count = len(points.landmarks)
     if points.triangles.shape != (count,) or points.barycentric.shape != (count, 3):
         raise TrackError(
-            f"the landmark embedding holds {count} landmarks, {len(points.triangles)} faces and "
-            f"{len(points.barycentric)} coordinates: they must be as many"
+            f"the landmark embedding holds {count} landmarks, {len(points.triangles)} faces and coordinates of "
+            f"{points.barycentric.shape}: they must be as many, three each"
         )
     inside = bool(count) and points.triangles.min() >= 0 and points.triangles.max() < faces
     if not inside or points.landmarks.min() < 0 or points.landmarks.max() >= POINTS:
@@ -134,6 +142,24 @@ def _check_points(points: SurfacePoints, faces: int) -> None:
         )
     if not np.allclose(points.barycentric.sum(1), 1, atol=1e-3):
         raise TrackError("the landmark embedding is damaged: barycentric coordinates do not sum to 1")
+
+
+def _check_rigid(
+    embedding: LandmarkEmbedding, template: NDArray[np.float64], faces: NDArray[np.int32]
+) -> None:
+    rigid = rigid_landmarks(embedding)
+    count = int(rigid.sum())
+    if count < LEAST_RIGID:
+        raise TrackError(
+            f"the landmark embedding holds {count} landmarks of the rigid upper face, at least {LEAST_RIGID} tell "
+            "its pose: give one with nose and eyes"
+        )
+    corners = template[faces[embedding.triangles[rigid]], :2]
+    seen = np.einsum("lc,lcx->lx", embedding.barycentric[rigid], corners)  # from the front
+    if np.linalg.svd(seen - seen.mean(0), compute_uv=False)[-1] < LEAST_BREADTH_M * np.sqrt(count):
+        raise TrackError(
+            "the landmarks of the upper face lie in one place or on one line: the head is damaged, or not in metres"
+        )
 
 
 def _joint(skeleton: Skeleton, row: int) -> Joint:
@@ -151,7 +177,7 @@ def _embedding(
     """The user's points, and the middle of each iris: the vertex of the ball that is farthest to the front."""
     landmarks, triangles, shares = [points.landmarks], [points.triangles], [points.barycentric]
     for landmark, joint in zip(IRIS_CENTRES, (LEFT_EYE, RIGHT_EYE), strict=True):
-        ball = np.flatnonzero(skeleton.weights[:, joint] > 0.5)
+        ball = np.intersect1d(np.flatnonzero(skeleton.weights[:, joint] > 0.5), faces)
         if not len(ball) or landmark in points.landmarks:
             continue
         front = ball[np.argmax(template[ball, 2])]

@@ -86,8 +86,40 @@ def test_wrong_files_are_refused_in_one_line(tmp_path: Path) -> None:
         ),
         ("far", FAKE.embedding(EMBEDDED) | {"lmk_face_idx": np.full(len(EMBEDDED), 10**6)}, "another head"),
         ("flat", FAKE.embedding(EMBEDDED) | {"lmk_b_coords": np.zeros(5)}, "must be as many"),
+        ("single", FAKE.embedding(EMBEDDED) | {"lmk_b_coords": np.float64(1)}, "must be as many"),
     ):
         np.savez(tmp_path / f"{name}.npz", **data)
         assert message in refused(path, tmp_path / f"{name}.npz")
     good.unlink()
     assert "landmark embedding is needed" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"f": np.zeros((0, 3), np.uint32)}, "0 faces"),
+        ({"v_template": [[0.0, 0.0, 0.0], [0.0]]}, "v_template is no array"),
+        ({"v_template": np.zeros_like(FAKE.content["v_template"])}, "in one place or on one line"),
+    ],
+)
+def test_a_damaged_head_is_refused_in_one_line(tmp_path: Path, change: dict, message: str) -> None:
+    path = FAKE.write(tmp_path)
+    path.write_bytes(pickle.dumps(FAKE.content | change, 2))
+    said = refused(path)
+    assert message in said and str(path) in said
+
+
+def test_masks_that_are_no_lists_of_vertices_are_refused_in_one_line(tmp_path: Path) -> None:
+    path, masks = FAKE.write(tmp_path), tmp_path / "FLAME_masks.pkl"
+    for wrong in ([[1, 2], [3]], ["lips"], [0.5]):
+        masks.write_bytes(pickle.dumps({"lips": wrong}, 2))
+        said = refused(path)
+        assert said.startswith(f"{masks}: lips is no") and "get the file again" in said
+
+
+def test_an_embedding_with_too_few_landmarks_for_a_pose_is_refused_before_any_work(tmp_path: Path) -> None:
+    path, few = FAKE.write(tmp_path), tmp_path / "few.npz"
+    for landmarks, count in (((13, 14), 0), ((13, 14, 33, 263), 2)):
+        np.savez(few, **FAKE.embedding(landmarks))
+        said = refused(path, few)
+        assert f"few.npz: the landmark embedding holds {count} landmarks" in said and "give one with" in said

@@ -105,10 +105,13 @@ def test_the_51_points_are_named_symmetrically(fake: FakeFlame) -> None:
         ({"weights": None}, "weights is missing"),
         ({"posedirs": np.zeros((3, 3, 36))}, r"posedirs is \(3, 3, 36\)"),
         ({"v_template": np.full((3, 3), np.nan)}, "v_template"),
+        ({"v_template": np.full((3, 3), 1e200)}, "numbers below 1e[+]06"),
         ({"shapedirs": "cut"}, "holds 300 shapes"),
         ({"kintree_table": np.zeros((2, 5))}, "joints are not root"),
         ({"f": np.full((4, 3), 10_000)}, "faces name vertices"),
         ({"v_template": np.array(["a"])}, "no numbers"),
+        ({"v_template": np.array(0.1)}, r"v_template is \(1,\)"),
+        ({"f": np.zeros((0, 3))}, "and 0 faces"),
     ],
 )
 def test_wrong_arrays_are_refused(fake: FakeFlame, change: dict, message: str) -> None:
@@ -128,10 +131,27 @@ def test_wrong_landmarks_are_refused(fake: FakeFlame) -> None:
         (replace(points, triangles=points.triangles + 10_000), "another head"),
         (replace(points, barycentric=points.barycentric * 2), "sum to 1"),
         (replace(points, landmarks=points.landmarks[1:]), "as many"),
-        (surface(fake, (168, 6, 197, 33, 263)), "inner lips"),
+        (surface(fake, (168, 6, 197, 33, 133, 263)), "inner lips"),
+        (surface(fake, (13, 14)), "holds 0 landmarks of the rigid upper face"),
+        (surface(fake, (13, 14, 33, 263)), "holds 2 landmarks of the rigid upper face"),
+        (surface(fake, (13, 14, 168, 6, 197, 195, 5, 4)), "on one line"),
     ):
         with pytest.raises(TrackError, match=message):
             flame_head("flame", arrays(fake), wrong, {})
+
+
+def test_eyeballs_without_faces_have_no_irises(fake: FakeFlame) -> None:
+    content = arrays(fake)
+    ball = np.flatnonzero(content["weights"][:, 3:].max(1) > 0.5)
+    bare = content | {"f": content["f"][~np.isin(content["f"], ball).any(1)]}
+    assert not {468, 473} & set(flame_head("flame", bare, surface(fake), {}).landmark_embedding.landmarks)
+
+
+def test_a_template_whose_landmarks_coincide_is_refused(fake: FakeFlame) -> None:
+    content = arrays(fake)
+    for template in (0 * content["v_template"], content["v_template"] * [0, 1, 1]):
+        with pytest.raises(TrackError, match="in one place or on one line"):
+            flame_head("flame", content | {"v_template": template}, surface(fake), {})
 
 
 @pytest.mark.parametrize("landmarks", [EMBEDDED, IBUG_51])
