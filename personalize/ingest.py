@@ -53,7 +53,7 @@ DESCRIPTIONS = {
     "too_dark": "the face is too dark",
     "blurred": "the face is blurred",
     "corrupt": "damaged in the file",
-    "duplicate": "the picture stands still",
+    "duplicate": "the picture before is repeated",
 }
 
 
