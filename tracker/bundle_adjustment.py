@@ -253,18 +253,29 @@ class _Problem:
         )
 
     def _normal(self, state: _State, damping: float) -> tuple[F64, F64, F64, F64]:
-        """Normal matrix [1 + R, 1 + R] and slope [1 + R] of log(focal) and shape, points and poses solved for.
+        """Normal matrix [1 + R, 1 + R] and slope [1 + R] of log(focal) and shape, with points and poses solved for.
+
+        Then what gives these back, see `_eliminated`.
+        """
+        off = 1 / (1 + self._off(state))
+        precision = off[:, None, None] * self._precision
+        pull = np.einsum("qij,qj->qi", precision, state.departure)
+        normal, slope, points, poses = self._eliminated(self._linear(state), precision, pull, damping)
+        away = state.log_focal - np.log(self._focal)
+        prior = np.array([self._focal_precision, *np.ones(len(state.shape))])
+        return normal + np.diag(prior), slope + prior * [away, *state.shape], points, poses
+
+    def _eliminated(
+        self, linear: _Linear, precision: F64, pull: F64, damping: float
+    ) -> tuple[F64, F64, F64, F64]:
+        """What observations tell of log(focal) and shape: normal matrix and slope, points and then poses solved for.
 
         Then what gives these back: for points [3Q, 6M + 1 + R + 1] by poses, focal and shape, and 1; for poses
         [6M, 1 + R + 1] by focal and shape, and 1.
         """
-        linear, off = self._linear(state), 1 / (1 + self._off(state))
-        precision = off[:, None, None] * self._precision
-        pull = np.einsum("qij,qj->qi", precision, state.departure)
-        away = state.log_focal - np.log(self._focal)
         residual, pose, point, focal = linear.residual, linear.pose, linear.point, linear.focal
         modes = self._surface.modes
-        m, q, r = len(state.rotation), len(modes), modes.shape[2]
+        m, q, r = self._by_frame.shape[0], len(modes), modes.shape[2]
         points = _summed(self._by_point, point.transpose(0, 2, 1) @ point)
         points_focal = _summed(self._by_point, np.einsum("oki,ok->oi", point, focal)).reshape(-1)
         points_slope = _summed(self._by_point, np.einsum("oki,ok->oi", point, residual))
@@ -274,16 +285,11 @@ class _Problem:
         basis = modes.reshape(3 * q, r)
         points_shape = (points @ modes).reshape(3 * q, r)
 
-        normal: F64 = np.diag([self._focal_precision, *np.ones(r)])
-        normal[0, 0] += (focal**2).sum()
+        normal: F64 = np.zeros((1 + r, 1 + r))
+        normal[0, 0] = (focal**2).sum()
         normal[0, 1:] = normal[1:, 0] = points_focal @ basis
-        normal[1:, 1:] += basis.T @ points_shape
-        slope: F64 = np.concatenate(
-            [
-                [self._focal_precision * away + (focal * residual).sum()],
-                state.shape + basis.T @ points_slope.reshape(-1),
-            ]
-        )
+        normal[1:, 1:] = basis.T @ points_shape
+        slope: F64 = np.concatenate([[(focal * residual).sum()], basis.T @ points_slope.reshape(-1)])
         points_common = np.column_stack([points_focal, points_shape])
         poses_focal = _summed(self._by_frame, np.einsum("oki,ok->oi", pose, focal)).reshape(-1)
         poses_common = np.column_stack([poses_focal, cross @ basis])

@@ -38,12 +38,22 @@ class FeatureTracks:
     observations: F32
 
     def select(self, rows: NDArray[np.integer], most: int) -> FeatureTracks:
-        """What was seen in some of the frames: of the tracks that are left those longest there, numbered as before."""
+        """What was seen in some of the frames, of no more tracks than `most`, numbered as before.
+
+        They are the longest of each frame: of all frames alike, since shots may have no track in common.
+        """
         frames = self.frames[rows]
         seen = self.observations[np.isin(self.observations[:, 0], frames)]
         number = seen[:, 1].astype(np.int64)
-        longest = np.argsort(-np.bincount(number, minlength=1), kind="stable")[:most]
-        return FeatureTracks(frames, seen[np.isin(number, longest)])
+        length = np.bincount(number, minlength=1)
+        order = np.lexsort((-length[number], seen[:, 0]))
+        _, first, count = np.unique(seen[:, 0], return_index=True, return_counts=True)
+        place = np.empty(len(seen), np.int64)
+        place[order] = np.arange(len(seen)) - np.repeat(first, count)
+        best = np.full(len(length), len(seen))
+        np.minimum.at(best, number, place)
+        chosen = np.lexsort((-length, best))[:most]
+        return FeatureTracks(frames, seen[np.isin(number, chosen)])
 
 
 def followed_frames(

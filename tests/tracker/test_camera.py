@@ -222,6 +222,26 @@ def test_a_long_clip_is_told_by_some_frames_and_its_turns_are_among_them(
     assert set(np.unique(bundle.observations[:, 0])) == set(range(80))
 
 
+def test_every_shot_keeps_tracks_when_there_are_too_many() -> None:
+    """Three shots without a track in common, the first of them long."""
+    rows = [
+        (frame, 100 * shot + track, 0, 0)
+        for shot, frames in enumerate((range(40), range(40, 50), range(50, 60)))
+        for frame in frames
+        for track in range(100)
+        if track < 50 or frame % 2
+    ]
+    tracks = FeatureTracks(np.arange(60, dtype=np.int32), np.array(rows, np.float32))
+    some = tracks.select(np.arange(0, 60, 2), 90)
+    numbers = np.unique(some.observations[:, 1]).astype(int)
+    assert some.frames.tolist() == list(range(0, 60, 2))
+    assert [int((numbers // 100 == shot).sum()) for shot in range(3)] == [30, 30, 30]
+    assert set(some.observations[:, 0]) == set(range(0, 60, 2))
+    whole = tracks.select(np.arange(60), 1000)
+    np.testing.assert_array_equal(whole.observations, tracks.observations)
+    assert (np.unique(tracks.select(np.arange(60), 30).observations[:, 1]) % 100 < 50).all()  # those longest
+
+
 def _face() -> np.ndarray:
     """Landmarks [478, 2] px of a schematic face: enough for the region and its motion."""
     rng = np.random.default_rng(0)
