@@ -46,7 +46,7 @@ def read_track_of(folder: Path, head: HeadModel, frames: Frames, landmarks: Land
     scale, shift = placement(pixels[good], seen[good])
     error = np.linalg.norm(scale * pixels + shift - seen, axis=-1)
     extent = np.ptp(seen[good], axis=1).max(-1, keepdims=True)
-    if np.median(error[good] / extent) > FARTHEST:
+    if not np.median(error[good] / extent) <= FARTHEST:  # nor is a NaN near
         raise UserError(f"{folder}: its faces do not lie on this video's; is it the tracking of another one?")
     return _track(head, on_video, frames, landmarks, good, error, extent, scale, shift)
 

@@ -61,8 +61,9 @@ _TEMPLES = (139, 368, 143, 372, 116, 345, 117, 346, 118, 347)
 _CHEEKS = (50, 280, 101, 330, 36, 266, 100, 329)
 _NOSE = (168, 6, 197, 195, 5, 4, 1, 19, 94, 2, 122, 351, 188, 412, 48, 278, 64, 294, 98, 327, 45, 275, 3, 248)
 # The part of the face that expressions move least; its hull lies above the mouth.
-STEADY_CORNERS = (33, 133, 362, 263, 129, 358, 98, 327, 97, 326, 75, 305)
 UPPER_FACE = (*_FOREHEAD, *_TEMPLES, *_CHEEKS, *_NOSE)
+# Corners of eyes and nose: they move little, and a sparse embedding has them.
+STEADY_CORNERS = (33, 133, 362, 263, 129, 358, 98, 327, 97, 326, 75, 305)
 
 # Of iBUG's 68 points those that stay on the skin, 17-67: brows, nose, eyes, outer and inner lips, each from the
 # subject's right to the left, or around from the right corner over the top.

@@ -84,7 +84,7 @@ class Track:
     jaw, neck: [T, 3] axis-angle rad. eyes: [T, 2, 3] axis-angle rad, left then right.
     rotation: [T, 3] axis-angle rad. translation: [T, 3] m. focal px. principal: [2] px. size: (width, height).
     head: `name@sha256` of the head model. lip_gap_mm: [T]. reprojection_px: [T], mean over landmarks.
-    Rows of invalid frames are finite: the nearest good pose, never measured.
+    Rows of invalid frames are finite and tell nothing: the nearest good pose, or another tracker's own.
     """
 
     time: F64
