@@ -25,7 +25,7 @@ MIN_SHOT_S = 0.5  # shorter shots are left out: too little to track
 CUT_LEVEL, CUT_RATIO, CUT_WINDOW_S = 1.5, 1.9, 0.28
 SAME_LEVEL = 1.0  # grey levels: no pixel of the thumbnail changes by more in a repeated picture
 # One that was coded anew changes by less than this (mean), and by so small a share of what pictures around it do.
-CODED_LEVEL, CODED_SHARE = 0.3, 0.15
+CODED_LEVEL, CODED_SHARE = 0.12, 0.15
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
