@@ -26,7 +26,7 @@ from tracker.energy import (
 )
 from tracker.gaze import eye_rotations
 from tracker.key_frames import key_frames
-from tracker.rigid_pose import hold_poses
+from tracker.rigid_pose import PLAUSIBLE, hold_poses
 from tracker.solver import Smoothness, solve_frames, solve_subject
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track, TrackError
 
@@ -74,7 +74,8 @@ def fit_track(
     smoothness = smoothness_between(energy, landmarks.time, good, segment)
     x, _ = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
     if camera.method != "prior":
-        x = hold_poses(x, bundle, good, runs(good, segment, landmarks.time), sound, 1.0)
+        run = runs(good, segment, landmarks.time)
+        x = hold_poses(x, bundle, good, run, sound, most=PLAUSIBLE)
     return make_track(landmarks, camera, head, energy, observed, identity, x, good)
 
 

@@ -17,7 +17,7 @@ from tracker.lip_motion import steadied
 from tracker.lip_opening import lip_edges
 from tracker.rigid_pose import hold_poses
 from tracker.skin_fit import Photometry, Subject, fit_landmarks, fit_stretch, learn_levels
-from tracker.skin_identity import fit_identity_to_skin
+from tracker.skin_identity import fit_identity_to_skin, nearer_to_skin
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
 from tracker.view import U8, Index
 
@@ -61,8 +61,9 @@ def refine_track(
 
     segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
     each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
-    look like keeps its landmark fit, and so does one whose picture is missing. bundle, evidence: see `fit_track`; poses
-    end halfway between what the grey levels and the bundle tell.
+    look like keeps its landmark fit, and so does one whose picture is missing. bundle: its poses are taken where skin
+    looks more alike from frame to frame under them; they end halfway between what grey levels and the bundle tell.
+    evidence: see `fit_track`.
     What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips and by how the
     lips move (tracker/lip_opening.py, tracker/lip_motion.py), depth by how the skin shifts in a turn
     (tracker/skin_identity.py), pose and jitter by the grey levels of the skin.
@@ -89,9 +90,11 @@ def refine_track(
         subject = subject.with_identity(identity)
         smoothness = smoothness_between(subject.energy, landmarks.time, good, segment)
         x = fit_landmarks(subject, x, smoothness)
-        if camera.method != "prior":
-            x = hold_poses(x, bundle, good, runs(good, segment, landmarks.time), sound, 1.0)
     rows = np.array([row for row in held if row in usual])
+    run = runs(good, segment, landmarks.time)
+    on_bundle = hold_poses(x, bundle, good, run, sound)
+    if rigid := nearer_to_skin(subject, held, rows, x, on_bundle):
+        x = on_bundle
     levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
     refined = x.copy()
@@ -107,8 +110,8 @@ def refine_track(
         deviation[rows[own]] = np.where(better[:, None], after, before)[own]
         if progress:
             progress(min(start + STRETCH, len(good)), len(good))
-    if camera.method != "prior":
-        refined = hold_poses(refined, bundle, good, runs(good, segment, landmarks.time), sound, HALFWAY)
+    if rigid:
+        refined = hold_poses(refined, bundle, good, run, sound, HALFWAY)
     out = make_track(landmarks, camera, head, subject.energy, opened, identity, refined, good)
     return Refined(out, _relative(deviation, good, len(track.time)))
 

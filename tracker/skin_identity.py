@@ -144,6 +144,25 @@ def fit_identity_to_skin(subject: Subject, cuts: Mapping[int, U8], keys: tuple[I
     return identity if after < before else start[0]
 
 
+def nearer_to_skin(subject: Subject, cuts: Mapping[int, U8], rows: Index, x: F64, other: F64) -> bool:
+    """Whether the skin in the frames `rows` looks more alike where `other` [n, U] puts it than where x [n, U] does.
+
+    cuts: the frames' faces, by rows. Each of the two is asked what it believes of light and noise, and both are judged
+    by either.
+    """
+    both, moves = (x[rows], other[rows]), _movements(subject)
+    identity = subject.identity.astype(np.float64)
+    mean = replace(subject.skin, rest=subject.skin.rest - moves @ subject.identity)
+    loss = np.zeros(2)
+    for at in both:
+        seen, basis = subject.look(rows, at)
+        skin = subject.photometric([cuts[row] for row in rows.tolist()], rows, seen, subject.blurs_px[-1])
+        skin = replace(skin, landmarks=subject.energy.select(rows), skin=mean)
+        energy = SubjectEnergy.at(skin, moves, basis, identity, at)
+        loss += [energy.skin_loss(energy.shape(identity), where).sum() for where in both]
+    return bool(loss[1] < loss[0])
+
+
 def _movements(subject: Subject) -> F32:
     """[P, 3, Ki] m, of the skin's points by the identity."""
     corners = subject.head.faces[subject.skin.triangles]

@@ -196,6 +196,22 @@ def test_the_bundles_poses_are_kept_where_it_has_them(film: Film):
     assert opening_error_mm(held, film.gap) < 1.02 * opening_error_mm(free, film.gap)
 
 
+def test_a_bundle_of_no_rigid_body_is_not_followed(film: Film):
+    """The skin of the pictures lies elsewhere, as where brows move: the fit is as if there were none."""
+    frames = np.arange(0, FRAMES, 2, dtype=np.int32)
+    swing = np.radians(2.0) * np.sin(frames / 3.0)
+    wrong = Rotation.from_euler("x", swing[:, None]) * Rotation.from_matrix(film.rotation[frames])
+    bundle = replace(
+        NO_BUNDLE,
+        frame=frames,
+        rotation=wrong.as_rotvec().astype(np.float32),
+        translation=film.translation[frames].astype(np.float32),
+    )
+    free, held = film.refine().track, film.refine(bundle=bundle).track
+    np.testing.assert_array_equal(held.rotation, free.rotation)
+    np.testing.assert_array_equal(held.expression, free.expression)
+
+
 def test_a_covered_mouth_loses_confidence(film: Film):
     pictures = [picture.copy() for picture in film.pictures]
     low = film.landmarks.points[10:13, [61, 291, 17], :2].mean((0, 1)).astype(int)
