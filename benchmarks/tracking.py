@@ -102,7 +102,7 @@ def stages(clip: Clip, head: HeadModel) -> Iterator[tuple[str, Track, float]]:
     landmarks, camera, count = clip.landmarks, clip.camera, len(clip.usable)
     evidence = None if clip.appearance is None else bare(clip.appearance)
     start = time.process_time()
-    track = fit_track(landmarks, camera, clip.bundle, head, clip.usable, clip.segment, evidence=evidence)
+    track = fit_track(landmarks, camera, head, clip.usable, clip.segment, evidence=evidence)
     spent = clip.spent + 1e3 * (time.process_time() - start) / count
     yield "landmarks", judged(track, clip), spent
     if (video := clip.video) is not None:

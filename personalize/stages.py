@@ -115,7 +115,7 @@ class CameraStage(Stage):
 class TrackStage(Stage):
     """One identity, and expression, pose and gaze in every frame, jointly over the clip."""
 
-    name, version = "track", 8
+    name, version = "track", 9
     needs = (
         *("ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz"),
@@ -128,9 +128,10 @@ class TrackStage(Stage):
     def make(self, context: Context, folder: Path) -> None:
         root = context.run.path
         frames = files.read_frames(root / "ingest/frames.npz")
+        camera, _ = files.read_camera(root / "camera")
         track = fit_track(
             files.read_landmarks(root / "landmarks/landmarks.npz"),
-            *files.read_camera(root / "camera"),
+            camera,
             run_head(context.settings),
             frames.usable,
             frames.segment,
@@ -143,7 +144,7 @@ class TrackStage(Stage):
 class Refine(Stage):
     """The track again, with the grey levels of the skin."""
 
-    name, folder, version = "refine", "photometric", 16
+    name, folder, version = "refine", "photometric", 17
     needs = (
         *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),

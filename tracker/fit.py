@@ -26,9 +26,8 @@ from tracker.energy import (
 )
 from tracker.gaze import eye_rotations
 from tracker.key_frames import key_frames
-from tracker.rigid_pose import PLAUSIBLE, hold_poses
 from tracker.solver import Smoothness, solve_frames, solve_subject
-from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track, TrackError
+from tracker.track import F32, F64, Camera, Landmarks, Track, TrackError
 
 if TYPE_CHECKING:
     from tracker.head import HeadModel
@@ -44,7 +43,6 @@ Frames = NDArray[np.int64]
 def fit_track(
     landmarks: Landmarks,
     camera: Camera,
-    bundle: Bundle,
     head: HeadModel,
     usable: NDArray[np.bool_],
     segment: NDArray[np.int32],
@@ -54,7 +52,6 @@ def fit_track(
 ) -> Track:
     """The head's identity, and expression, pose and gaze in every frame, under the given camera.
 
-    bundle: its poses take the place of the landmarks' own unless the focal length is the prior's.
     usable: [T] bool, frames that may be measured. segment: [T], number of the uninterrupted shot;
     smoothness never crosses from one to another.
     evidence: [T] 0..1, how far each frame's landmarks are followed, less where something covers the face: below one
@@ -73,9 +70,6 @@ def fit_track(
     followed = replace(energy, visible=energy.visible * share[:, None])
     smoothness = smoothness_between(energy, landmarks.time, good, segment)
     x, _ = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
-    if camera.method != "prior":
-        run = runs(good, segment, landmarks.time)
-        x = hold_poses(x, bundle, good, run, sound, most=PLAUSIBLE)
     return make_track(landmarks, camera, head, energy, observed, identity, x, good)
 
 

@@ -82,6 +82,11 @@ def refine_track(
     held, cuts, colours = _looked_at(subject, lines, camera, frames, good, {*usual, *rest, *other})
     if not held:
         return Refined(track, unknown)
+    rows = np.array([row for row in held if row in usual])
+    run = runs(good, segment, landmarks.time)
+    on_bundle = hold_poses(x, bundle, good, run, sound)
+    if rigid := nearer_to_skin(subject, held, rows, x, on_bundle):
+        x = on_bundle
     widths = _read_widths(lines, colours, good, segment, landmarks.time, sound)
     opened = lines.opened(observed, lines.widths(_fitted(subject, observed, x)) if widths is None else widths)
     subject = _with_landmarks(subject, opened, x, sound)
@@ -90,11 +95,7 @@ def refine_track(
         subject = subject.with_identity(identity)
         smoothness = smoothness_between(subject.energy, landmarks.time, good, segment)
         x = fit_landmarks(subject, x, smoothness)
-    rows = np.array([row for row in held if row in usual])
-    run = runs(good, segment, landmarks.time)
-    on_bundle = hold_poses(x, bundle, good, run, sound)
-    if rigid := nearer_to_skin(subject, held, rows, x, on_bundle):
-        x = on_bundle
+        x = hold_poses(x, bundle, good, run, sound) if rigid else x
     levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
     refined = x.copy()

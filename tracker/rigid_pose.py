@@ -19,9 +19,6 @@ Rows = NDArray[np.int64]
 Corrections = list[tuple[Rows, F64]]
 
 MIN_FRAMES = 8  # fewer do not tell how the two head frames lie to each other
-# Of the turn between the two poses. On all heads whose truth is known 95 % are below 2.3 degrees, and are
-# the landmarks' error; beyond it brows move, and what the tracks follow is not one rigid body. Pictures tell it better.
-PLAUSIBLE, PLAUSIBLE_QUANTILE = np.radians(2.5), 0.95
 CERTAIN = np.array([[1.0], [1.0], [0.1]])  # of a landmark pose's place: depth is seen ten times less well
 LEAST_SEEN = 0.3  # of the points that a frame of the bundle usually sees: with fewer its pose may be anything
 FADE = 12  # frames beyond the last one known over which its correction fades
@@ -34,13 +31,11 @@ def hold_poses(
     run: NDArray[np.int64],
     sound: Rows,
     share: float = 1.0,
-    most: float = np.inf,
 ) -> F64:
     """The unknowns x [n, P] of the frames good [n] with their poses moved by a share of the way to the bundle's.
 
     run: [n], frames of one number follow each other without a break; nothing is carried from one to another.
     sound: rows of x whose poses tell how the two head frames lie to each other, and where the difference is known.
-    most: rad, of the turn between the two poses in PLAUSIBLE_QUANTILE of the frames; beyond it x stays.
     """
     known = np.isin(bundle.frame, good[sound]) & _well_seen(bundle)
     row = np.searchsorted(good, bundle.frame[known])
@@ -48,8 +43,6 @@ def hold_poses(
         return x
     rotation = Rotation.from_rotvec(bundle.rotation[known]).as_matrix()
     change = _corrections(x[row], rotation, bundle.translation[known].astype(np.float64))
-    if np.quantile(np.linalg.norm(change[:, :3], axis=1), PLAUSIBLE_QUANTILE) > most:
-        return x
     step = np.median(np.diff(bundle.frame))
     ends = np.flatnonzero((np.diff(row) > 1.5 * step) | (np.diff(run[row]) != 0)) + 1
     stretches: dict[int, Corrections] = {}

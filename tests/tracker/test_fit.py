@@ -11,14 +11,12 @@ from tracker.fit import fit_track, make_track, resume, runs, with_lips_shut
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, INNER_LIP_LOWER, POINTS
 from tracker.modes import LIP_SHAPES
-from tracker.track import Bundle, Camera, Landmarks, TrackError
+from tracker.track import Camera, Landmarks, TrackError
 
 HEAD = load_head()
 NAMES = list(HEAD.expression_names)
 SIZE, FOCAL, DISTANCE = (1280, 720), 1500.0, 0.65
 CAMERA = Camera(FOCAL, 0.0, (639.5, 359.5), (), SIZE, "given", "")
-EMPTY = np.zeros((0, 3), np.float32)
-NO_BUNDLE = Bundle(np.zeros(0, np.int32), EMPTY, EMPTY, EMPTY, np.zeros((0, 4), np.float32))
 NOISE = 0.0035  # of the outer-eye distance, which is about 0.09 m
 
 
@@ -83,19 +81,13 @@ class Talker:
         frames = len(landmarks.time)
         usable = np.ones(frames, bool) if usable is None else usable
         segment = np.zeros(frames, np.int32) if segment is None else segment
-        return fit_track(landmarks, camera, NO_BUNDLE, HEAD, usable, segment, evidence=evidence)
+        return fit_track(landmarks, camera, HEAD, usable, segment, evidence=evidence)
 
 
 def turn_error_deg(track, truth):
     """[T] degrees."""
     relative = Rotation.from_rotvec(track.rotation) * Rotation.from_matrix(truth).inv()
     return np.degrees(relative.magnitude())
-
-
-def swing_deg(track, truth):
-    """Mean rotation error without the constant difference of the two head frames."""
-    relative = Rotation.from_matrix(truth).inv() * Rotation.from_rotvec(track.rotation)
-    return np.degrees((relative * relative.mean().inv()).magnitude()).mean()
 
 
 def without_face(landmarks: Landmarks, gone: slice) -> Landmarks:
@@ -241,9 +233,7 @@ def test_a_mouth_that_opens_in_another_profile_is_followed():
     usable, shot = np.ones(75, bool), np.zeros(75, np.int32)
     errors = []
     for sd in (Weights().lip_shape_sd, 1e-3):
-        track = fit_track(
-            landmarks, CAMERA, NO_BUNDLE, HEAD, usable, shot, weights=replace(Weights(), lip_shape_sd=sd)
-        )
+        track = fit_track(landmarks, CAMERA, HEAD, usable, shot, weights=replace(Weights(), lip_shape_sd=sd))
         errors.append(track.lip_gap_mm - 0.8 * talker.gap)
     followed, held = (np.sqrt(np.mean(error**2)) for error in errors)
     assert followed < 0.5 * held
@@ -412,7 +402,6 @@ def test_progress_ends_at_its_total(talker):
     fit_track(
         talker.landmarks,
         CAMERA,
-        NO_BUNDLE,
         HEAD,
         np.ones(150, bool),
         np.zeros(150, np.int32),
@@ -420,22 +409,6 @@ def test_progress_ends_at_its_total(talker):
     )
     assert seen[-1][0] == seen[-1][1]
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
-
-
-@pytest.mark.parametrize(("method", "held"), [("bundle", True), ("given", True), ("prior", False)])
-def test_poses_are_the_bundles_unless_the_focal_length_is_the_priors(talker, track, method, held: bool):
-    frames = np.arange(0, 150, 3, dtype=np.int32)
-    bundle = replace(
-        NO_BUNDLE,
-        frame=frames,
-        rotation=Rotation.from_matrix(talker.rotation[frames]).as_rotvec().astype(np.float32),
-        translation=talker.translation[frames].astype(np.float32),
-    )
-    camera = replace(CAMERA, method=method)
-    everything = np.ones(150, bool), np.zeros(150, np.int32)
-    found = fit_track(talker.landmarks, camera, bundle, HEAD, *everything)
-    swing, free = swing_deg(found, talker.rotation), swing_deg(track, talker.rotation)
-    assert swing < 0.5 * free if held else swing == pytest.approx(free, rel=1e-6)
 
 
 def test_repeated_pictures_break_no_stretch_and_missing_ones_do():

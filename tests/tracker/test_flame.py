@@ -15,7 +15,7 @@ from tracker.flame import SurfacePoints, flame_head
 from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, IBUG_51, MIRRORED, POINTS, UPPER_FACE
 from tracker.modes import head_modes, movements
-from tracker.track import Bundle, Camera, Landmarks, TrackError
+from tracker.track import Camera, Landmarks, TrackError
 
 RNG = np.random.default_rng(5)
 
@@ -197,10 +197,8 @@ def test_the_fit_finds_opening_and_pose(head: HeadModel) -> None:
         BLENDSHAPE_NAMES,
         (1280, 720),
     )
-    empty = np.zeros((0, 3), np.float32)
-    bundle = Bundle(np.zeros(0, np.int32), empty, empty, empty, np.zeros((0, 4), np.float32))
     track = fit_track(
-        landmarks, Camera(focal, 0.0, (639.5, 359.5), (), (1280, 720), "given", ""), bundle, head,
+        landmarks, Camera(focal, 0.0, (639.5, 359.5), (), (1280, 720), "given", ""), head,
         np.ones(frames, bool), np.zeros(frames, np.int32),
     )  # fmt: skip
     gap = head.lip_gap_mm(head.vertices(identity, expression, jaw=jaw))

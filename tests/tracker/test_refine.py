@@ -50,6 +50,7 @@ class Film:
     rotation: np.ndarray
     translation: np.ndarray
     gap: np.ndarray
+    expression: np.ndarray
     track: Track
 
     def frames(self):
@@ -105,8 +106,9 @@ def filmed(albedo: np.ndarray, opening_error_mm: float = 0.0, identity: np.ndarr
     scores = np.zeros((FRAMES, len(BLENDSHAPE_NAMES)), np.float32)
     landmarks = Landmarks(t, points, np.ones(FRAMES, np.float32), scores, BLENDSHAPE_NAMES, SIZE)
     usable, segment = np.ones(FRAMES, bool), np.zeros(FRAMES, np.int32)
-    track = fit_track(landmarks, CAMERA, NO_BUNDLE, HEAD, usable, segment)
-    return Film(noisy, landmarks, rotation, translation, np.asarray(HEAD.lip_gap_mm(vertices)), track)
+    track = fit_track(landmarks, CAMERA, HEAD, usable, segment)
+    gap = np.asarray(HEAD.lip_gap_mm(vertices))
+    return Film(noisy, landmarks, rotation, translation, gap, expression, track)
 
 
 def turn_error_deg(track: Track, truth: np.ndarray) -> float:
@@ -178,6 +180,13 @@ def test_lips_are_not_followed_across_pictures_that_are_missing(film: Film, monk
     assert (np.delete(widths, (8, 9), axis=0) == 1).all()
 
 
+def motion_error_mm(track: Track, film: Film) -> float:
+    """Mean over the face's vertices and frames, about its mean over time."""
+    apart = np.tensordot(track.expression - film.expression, HEAD.expression_basis, axes=1)
+    apart = 1e3 * (apart - apart.mean(0))[:, HEAD.regions["face"]]
+    return float(np.linalg.norm(apart, axis=-1).mean())
+
+
 def test_the_bundles_poses_are_kept_where_it_has_them(film: Film):
     frames = np.arange(0, FRAMES, 3, dtype=np.int32)
     rotation = Rotation.from_matrix(film.rotation[frames]).as_rotvec().astype(np.float32)
@@ -186,13 +195,8 @@ def test_the_bundles_poses_are_kept_where_it_has_them(film: Film):
     )
     free, held = film.refine().track, film.refine(bundle=bundle).track
     assert turn_error_deg(held, film.rotation) < 0.6 * turn_error_deg(free, film.rotation)
-    # The skin is compared from other poses, no more: single weights can trade, what they move is the same.
-    apart = held.expression - free.expression
-    np.testing.assert_allclose(apart, 0, atol=0.1)
-    assert np.sqrt((apart**2).mean()) < 0.006
-    apart_mm = 1e3 * np.linalg.norm(np.tensordot(apart, HEAD.expression_basis, axes=1), axis=-1)
-    apart_mm = apart_mm[:, HEAD.regions["face"]]
-    assert apart_mm.mean() < 0.04 and apart_mm.max() < 0.4
+    # What moves in the face is found as well.
+    assert motion_error_mm(held, film) < 1.02 * motion_error_mm(free, film)
     assert opening_error_mm(held, film.gap) < 1.02 * opening_error_mm(free, film.gap)
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tracker.energy import rotation_matrix, rotation_vector
-from tracker.rigid_pose import FADE, PLAUSIBLE, hold_poses
+from tracker.rigid_pose import FADE, hold_poses
 from tracker.track import Bundle
 
 FRAMES, STEP = 90, 3
@@ -78,16 +78,10 @@ def test_nothing_is_carried_over_a_cut_nor_far_from_a_window(truth):
     assert np.degrees(np.abs(step)).max() < 0.3
 
 
-def test_without_a_bundle_or_with_one_of_no_rigid_body_poses_stay(truth):
+def test_without_a_bundle_poses_stay(truth):
     start = drifted(truth)
-    none = bundle_of(truth, GOOD[:0])
-    np.testing.assert_array_equal(hold_poses(start, none, GOOD, RUN, GOOD, 1.0), start)
-    wild = bundle_of(truth, GOOD[::STEP])
-    noise = np.random.default_rng(0).normal(size=wild.rotation.shape).astype(np.float32)
-    wild = replace(wild, rotation=wild.rotation + 0.2 * noise)
-    np.testing.assert_array_equal(hold_poses(start, wild, GOOD, RUN, GOOD, most=PLAUSIBLE), start)
-    held = hold_poses(start, bundle_of(truth, GOOD[::STEP]), GOOD, RUN, GOOD, most=PLAUSIBLE)
-    assert error_deg(held, truth).mean() < 0.1
+    for frames in (GOOD[:0], GOOD[:7]):
+        np.testing.assert_array_equal(hold_poses(start, bundle_of(truth, frames), GOOD, RUN, GOOD), start)
 
 
 def test_a_place_whose_depth_is_uncertain_moves_nothing_sideways(truth):
