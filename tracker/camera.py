@@ -29,15 +29,13 @@ FOCAL_RANGE = (0.6, 5.0)  # of the long side
 LEAST_SD_LOG = 0.08  # of log(focal): what light and skin that moves do to all tracks alike
 TOLD = 0.8  # of the prior's uncertainty: a clip that leaves more of it has told nothing
 MIN_TURN_DEG = 8.0  # a head that turns less leaves focal length and depth undecided
-# Of the distance between the outer eye corners: farther landmarks do not count for a frame's pose.
-OUTLIER = 0.08
+# Of the distance between the outer eye corners: farther landmarks, and points that were followed, do not count for a
+# frame's pose.
+OUTLIER, TRACK_OUTLIER = 0.08, 0.02
 FEW = 20  # landmarks of the upper face: a user's sparse embedding has less, and most of them on the nose's ridge
 MIN_OBSERVATIONS = 12  # of a frame in the bundle
 MIN_LENGTH = 3  # observations of a point in the bundle
 ADJUSTED, MOST_POINTS = 250, 600  # frames and points adjusted together: the time grows by their squares
-TRACK_OUTLIER = (
-    0.02  # of the distance between the outer eye corners: farther tracks do not count for a frame's pose
-)
 
 
 def estimate_camera(
@@ -187,10 +185,11 @@ def _resected(
     """
     model = camera_model(camera.focal_px, camera.principal_px, camera.size)
     frames, poses, seen = [], [], []
+    known = tracks.observations[np.isin(tracks.observations[:, 1], kept)].astype(np.float64)
+    known[:, 1] = np.searchsorted(kept, known[:, 1])
     for frame in np.setdiff1d(tracks.frames, scene.frames).tolist():
-        rows = tracks.observations[tracks.observations[:, 0] == frame].astype(np.float64)
-        rows = rows[np.isin(rows[:, 1], kept)]
-        rows[:, 1] = np.searchsorted(kept, rows[:, 1])
+        first, last = np.searchsorted(known[:, 0], (frame, frame + 1))
+        rows = known[first:last]
         right, left = landmarks.points[frame, [RIGHT_EYE_OUTER, LEFT_EYE_OUTER], :2]
         error = TRACK_OUTLIER * float(np.linalg.norm(left - right))
         if len(rows) < MIN_OBSERVATIONS:
