@@ -27,9 +27,7 @@ NOSE = 0.6  # of the way from the eyes to the mouth
 RADII_M = {"left eye": 0.022, "right eye": 0.022, "nose": 0.018, "mouth": 0.026}
 BLUR_M = 0.001
 SMALLEST = 10  # px, of a part's sides
-ALIKE = (
-    0.5  # correlation below which the shift means nothing: of six millimetres one part in eight falls below
-)
+ALIKE = 0.5  # correlation below which the shift means nothing
 STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
 
 

@@ -28,7 +28,7 @@ TURN_S, TURN_BACK_S, TURN_RISE_S = (
     2.74,
     0.2,
 )  # of the fast head turn: when, when back, how long each takes
-CUT_S = 2.0
+CUT_S = 2.0  # that are missing at a cut
 LIP_ROLL = 0.4  # of the demo's: lower lips on real film hardly roll in, not at /f v/ either
 Colour = tuple[float, float, float]
 

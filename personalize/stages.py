@@ -89,7 +89,7 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 6, ("focal_px", "distortion")
+    name, version, reads = "camera", 7, ("focal_px", "distortion")
     needs = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz")
     makes = ("camera.json", "bundle.npz")
 

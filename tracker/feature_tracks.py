@@ -15,7 +15,10 @@ from tracker.track import F32, F64, Landmarks
 
 SPACING_S = 0.12  # between the frames that are followed: about every third at 25 fps
 MIN_PRESENCE = 0.5
-CORNERS, PATCHES = 250, 1500  # wanted in a picture, and in all of a clip
+CORNERS = 250  # wanted in a picture
+# A patch that was looked for so often, and found in less than one in so many, is given up: of a clip of an hour there
+# would be more of them than can be looked for.
+PATIENCE = 10
 REPLENISH = 5  # followed frames between searches for new corners
 EYE_DISTANCE = (
     160.0  # px between the outer eye corners, at most: a larger face is followed in a smaller picture
@@ -135,9 +138,12 @@ class _Follower:
     def __init__(self, scale: float) -> None:
         self._scale = scale
         self._templates = NO_TEMPLATES
+        self._begun_count = 0
+        self._numbers = np.zeros(0, np.int64)
         self._begun = np.zeros((0, 2))  # px, where each was first seen
         self._face = np.zeros((0, len(UPPER_FACE), 2))  # px, the landmarks there
         self._offset = np.zeros((0, 2))  # px, from where the landmarks put it to where it was last
+        self._tries, self._finds = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._age = 0
 
     def next(self, rgb: NDArray[np.uint8], points: F32) -> tuple[NDArray[np.int64], F32]:
@@ -149,31 +155,42 @@ class _Follower:
         face = ((points + 0.5) * scale - 0.5).astype(np.float32)
         region, texture = upper_face_mask(face, gray.shape), fine_texture(gray)
         rows, xy = self._found(texture, face, region)
+        numbers = self._numbers[rows]
         if self._age % REPLENISH == 0:
+            self._give_up()
             more, places = self._replenished(texture, face, region, xy)
-            rows, xy = np.concatenate([rows, more]), np.concatenate([xy, places])
+            numbers, xy = np.concatenate([numbers, more]), np.concatenate([xy, places])
         self._age += 1
-        return rows, ((xy + 0.5) / scale - 0.5).astype(np.float32)
+        return numbers, ((xy + 0.5) / scale - 0.5).astype(np.float32)
 
     def _found(self, texture: F32, face: F32, region: NDArray[np.uint8]) -> tuple[NDArray[np.int64], F64]:
         """Rows [n] of the patches seen again, and where [n, 2] px."""
-        if not len(self._begun):
+        if not len(self._numbers):
             return np.zeros(0, np.int64), np.zeros((0, 2))
         reach = REACH * float(np.linalg.norm(face[LEFT_EYE_OUTER] - face[RIGHT_EYE_OUTER]))
         expected, bend = _carried(self._begun, self._face, face[list(UPPER_FACE)].astype(np.float64), reach)
         guess = expected + self._offset
         rows = np.flatnonzero(_inside(region, guess) & (np.linalg.det(bend) > MIN_SHRINK))
+        self._tries[rows] += 1
         xy, found = register(texture, guess[rows], bend[rows], self._templates.select(rows))
         found &= _inside(region, xy)
         rows, xy = rows[found], xy[found]
+        self._finds[rows] += 1
         self._offset[rows] = xy - expected[rows]
         return rows, xy
+
+    def _give_up(self) -> None:
+        """Drop the patches that are hardly ever found."""
+        hopeful = (self._tries < PATIENCE) | (PATIENCE * self._finds > self._tries)
+        self._templates = self._templates.select(hopeful)
+        for name in ("_numbers", "_begun", "_face", "_offset", "_tries", "_finds"):
+            setattr(self, name, getattr(self, name)[hopeful])
 
     def _replenished(
         self, texture: F32, face: F32, region: NDArray[np.uint8], seen: F64
     ) -> tuple[NDArray[np.int64], F64]:
         """Numbers [n] and places [n, 2] px of new patches where none of those seen [k, 2] px is."""
-        wanted = min(CORNERS - len(seen), PATCHES - len(self._begun))
+        wanted = CORNERS - len(seen)
         # Evenly over the region: as many corners as fit at this distance.
         apart = max(2.0, 0.7 * np.sqrt(np.count_nonzero(region) / CORNERS))
         free = region.copy()
@@ -188,12 +205,17 @@ class _Follower:
         templates = cut_templates(texture, places)
         sound = templates.corners()
         places, count = places[sound], int(sound.sum())
-        numbers = len(self._begun) + np.arange(count)
+        numbers = self._begun_count + np.arange(count)
+        self._begun_count += count
+        self._numbers = np.concatenate([self._numbers, numbers])
         self._templates = self._templates.joined(templates.select(sound))
         self._begun = np.concatenate([self._begun, places])
         landmarks = np.broadcast_to(face[list(UPPER_FACE)], (count, len(UPPER_FACE), 2))
         self._face = np.concatenate([self._face, landmarks])
         self._offset = np.concatenate([self._offset, np.zeros((count, 2))])
+        self._tries, self._finds = (
+            np.concatenate([counted, np.zeros(count, np.int64)]) for counted in (self._tries, self._finds)
+        )
         return numbers, places
 
 

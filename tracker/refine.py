@@ -80,9 +80,9 @@ def refine_track(
     usual = sound[np.linspace(0, len(sound) - 1, count).round().astype(int)]
     rest, other = (sound[part] for part in key_frames(observed[sound], energy.px_per_m[sound], count // 2))
     held, cuts, colours = _looked_at(subject, lines, camera, frames, good, {*usual, *rest, *other})
-    if not held:
+    rows = np.array([row for row in held if row in usual], np.int64)
+    if not len(rows):
         return Refined(track, unknown)
-    rows = np.array([row for row in held if row in usual])
     run = runs(good, segment, landmarks.time)
     on_bundle = hold_poses(x, bundle, good, run, sound)
     if rigid := nearer_to_skin(subject, held, rows, x, on_bundle):

@@ -25,12 +25,7 @@ FADE = 12  # frames beyond the last one known over which its correction fades
 
 
 def hold_poses(
-    x: F64,
-    bundle: Bundle,
-    good: Rows,
-    run: NDArray[np.int64],
-    sound: Rows,
-    share: float = 1.0,
+    x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], sound: Rows, share: float = 1.0
 ) -> F64:
     """The unknowns x [n, P] of the frames good [n] with their poses moved by a share of the way to the bundle's.
 

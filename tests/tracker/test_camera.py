@@ -9,7 +9,13 @@ from scipy.spatial.transform import Rotation
 
 import tracker.camera as subject
 from tracker.camera import PRIOR_FOCAL, PRIOR_SD_LOG, estimate_camera
-from tracker.feature_tracks import FeatureTracks, followed_frames, track_features, upper_face_mask
+from tracker.feature_tracks import (
+    FeatureTracks,
+    _Follower,
+    followed_frames,
+    track_features,
+    upper_face_mask,
+)
 from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import LEFT_EYE, POINTS, RIGHT_EYE, UPPER_FACE
 from tracker.raster import project
@@ -293,3 +299,17 @@ def test_tracks_follow_the_picture_and_over_a_cut_the_same_face_alone(same_face:
         if same_face or over[-1:] != [True]:
             assert np.abs(moved - (shift[frame] - shift[frame[0]])).max() < 0.3
     assert np.mean(over) > 0.95 if same_face else np.mean(over) < 0.02
+
+
+def test_patches_that_are_never_found_again_are_given_up() -> None:
+    """Pictures of noise: none looks like the one before."""
+    rng = np.random.default_rng(0)
+    follower = _Follower(1.0)
+    face = _face().astype(np.float32)
+    held, numbers = [], []
+    for _ in range(60):
+        noise = cv2.GaussianBlur(rng.integers(0, 255, (480, 640, 3), dtype=np.uint8), (0, 0), 2)
+        seen, _ = follower.next(cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX), face)
+        held.append(len(follower._numbers))
+        numbers.extend(seen.tolist())
+    assert max(held) < 600 and max(numbers) > 2500
