@@ -180,14 +180,10 @@ def smoothness_between(
     energy: Energy, time: F64, good: Frames, segment: NDArray[np.int32], factor: F64 | None = None
 ) -> Smoothness:
     """Smoothness of the measured frames `good` of a clip, inside its shots. time, segment: [T]. factor: [P], on it."""
-    step = np.diff(time[good])
-    interval = float(np.median(step)) if len(step) else 0.04
     sd = np.repeat(energy.weights.acceleration, (energy.model.expressions, 3, 3))
-    # The integral of white noise bends by the power 1.5 of the interval.
     factor = np.ones(len(sd)) if factor is None else factor
-    precision = factor / (sd * (interval / 0.04) ** 1.5) ** 2
     tolerated = float(factor[-1]) * energy.weights.jerk**2
-    return Smoothness.between(runs(good, segment, time), precision, tolerated)
+    return Smoothness.between(runs(good, segment, time), time[good], factor / sd**2, tolerated)
 
 
 def resume(

@@ -16,13 +16,18 @@ from tracker.lip_lines import LOG, SAMPLES, STEP_MM
 from tracker.track import F64
 from tracker.view import U8
 
-APART = (1, 2, 4, 8)  # frames between which motion is looked for: the farther, the less errors add up
+LONGEST_S = (
+    0.35  # between two frames in which motion is looked for: the farther apart, the less errors add up
+)
 BESIDE = 25  # samples beside an edge, from the first step on: 10 mm of lip and skin
 # Samples of a line that are looked at: 13 mm to both sides of its middle. Nose and chin move on their own.
 FIRST, LAST = (int(np.abs(SAMPLES - end).argmin()) for end in (-13.0, 13.0))
 REACH, FINER = 5, 2  # steps to both sides of what the edges tell, and trials in a step
 NEIGHBOUR = 0.5  # weight of the two lines beside a line in its motion
 STRETCH = 1.1  # of an edge's motion to that of what lies beside it
+STEP_S = (
+    0.04  # from frame to frame, of which the following are told: errors last for so long, whatever the rate
+)
 # Standard deviations of a width by its edges, as if each frame erred on its own (shut lips err by .1 mm, open ones by
 # .4 to .6, some eight frames alike), and of its change from one frame to the next: so much, and a share of it more. On
 # rendered films the change errs by half of that share, but real lips thicken and roll as they move.
@@ -31,27 +36,31 @@ MOVED_MM, MOVED_SHARE = 0.1, 0.2
 DOUBT_MM = 1.0  # by which edges and motion disagree where the motion counts half
 
 
-def steadied(edges: F64, colours: U8, run: NDArray[np.int64]) -> F64:
+def steadied(edges: F64, colours: U8, run: NDArray[np.int64], time: F64) -> F64:
     """[n, Q] mm, widths between edges [n, Q, 2] mm along lines of colours [n, Q, S, 3] u8 that agree with their motion.
 
     run: [n], the same number for frames between which lips may be followed, -1 for frames in which they are not.
-    Least squares over both, line by line: the widths' own, and their changes between frames APART apart.
+    time: [n] s, ascending. Least squares over both, line by line: the widths' own, and their changes between frames
+    1, 2, 4, .. apart.
     """
     widths = np.maximum(edges[..., 1] - edges[..., 0], 0.0)
     count = len(widths)
-    weight = (EDGE_MM + EDGE_SHARE * widths) ** -2.0
+    rate = float(np.median(np.diff(time))) / STEP_S if count > 1 else 1.0
+    links = [2**n for n in range(max(1, int(np.log2(LONGEST_S / STEP_S / rate)) + 1))]
+    weight = rate * (EDGE_MM + EDGE_SHARE * widths) ** -2.0
     # The upper diagonals of the normal matrix, as solveh_banded has them, for each line.
-    normal = np.zeros((max(APART) + 1, *widths.shape))
+    normal = np.zeros((max(links) + 1, *widths.shape))
     right = weight * widths
     normal[-1] = weight
-    for apart in APART:
+    for apart in links:
         linked = (run[apart:] == run[:-apart]) & (run[apart:] >= 0)
         change = np.zeros((max(count - apart, 0), widths.shape[1]))
         _fill_changes(colours, edges, np.flatnonzero(linked), apart, change)
         change *= STRETCH
         told = widths[apart:] - widths[:-apart]
         fast = np.maximum(np.abs(told), np.abs(change))
-        trust = linked[:, None] / (np.sqrt(apart) * MOVED_MM + MOVED_SHARE * fast) ** 2 / len(APART)
+        steps = (time[apart:] - time[:-apart])[:, None] / STEP_S
+        trust = rate / len(links) * linked[:, None] / (np.sqrt(steps) * MOVED_MM + MOVED_SHARE * fast) ** 2
         trust /= 1 + ((change - told) / DOUBT_MM) ** 2
         normal[-1, :-apart] += trust
         normal[-1, apart:] += trust

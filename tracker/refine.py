@@ -83,8 +83,8 @@ def refine_track(
     rows = np.array([row for row in held if row in usual], np.int64)
     if not len(rows):
         return Refined(track, unknown)
-    run = runs(good, segment, landmarks.time)
-    on_bundle = hold_poses(x, bundle, good, run, sound)
+    run, time = runs(good, segment, landmarks.time), landmarks.time[good]
+    on_bundle = hold_poses(x, bundle, good, run, time, sound)
     if rigid := nearer_to_skin(subject, held, rows, x, on_bundle):
         x = on_bundle
     widths = _read_widths(lines, colours, good, segment, landmarks.time, sound)
@@ -95,7 +95,7 @@ def refine_track(
         subject = subject.with_identity(identity)
         smoothness = smoothness_between(subject.energy, landmarks.time, good, segment)
         x = fit_landmarks(subject, x, smoothness)
-        x = hold_poses(x, bundle, good, run, sound) if rigid else x
+        x = hold_poses(x, bundle, good, run, time, sound) if rigid else x
     levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
     refined = x.copy()
@@ -112,7 +112,7 @@ def refine_track(
         if progress:
             progress(min(start + STRETCH, len(good)), len(good))
     if rigid:
-        refined = hold_poses(refined, bundle, good, run, sound, HALFWAY)
+        refined = hold_poses(refined, bundle, good, run, time, sound, HALFWAY)
     out = make_track(landmarks, camera, head, subject.energy, opened, identity, refined, good)
     return Refined(out, _relative(deviation, good, len(track.time)))
 
@@ -131,7 +131,8 @@ def _read_widths(
     if edges is None:
         return None
     widths = lines.marks[..., 2] - lines.marks[..., 1]
-    widths[rows] = steadied(edges, along, np.where(bare, runs(good[rows], segment, time), -1))
+    run = np.where(bare, runs(good[rows], segment, time), -1)
+    widths[rows] = steadied(edges, along, run, time[good[rows]])
     return widths
 
 

@@ -16,21 +16,22 @@ from tracker.energy import rotation_matrix, rotation_vector
 from tracker.track import F64, Bundle
 
 Rows = NDArray[np.int64]
-Corrections = list[tuple[Rows, F64]]
+Corrections = list[tuple[F64, F64]]  # times [k] s and corrections [k, 6] of a stretch of frames
 
 MIN_FRAMES = 8  # fewer do not tell how the two head frames lie to each other
 CERTAIN = np.array([[1.0], [1.0], [0.1]])  # of a landmark pose's place: depth is seen ten times less well
 LEAST_SEEN = 0.3  # of the points that a frame of the bundle usually sees: with fewer its pose may be anything
-FADE = 12  # frames beyond the last one known over which its correction fades
+FADE_S = 0.48  # beyond the last frame known: the time over which its correction fades
 
 
 def hold_poses(
-    x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], sound: Rows, share: float = 1.0
+    x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], time: F64, sound: Rows, share: float = 1.0
 ) -> F64:
     """The unknowns x [n, P] of the frames good [n] with their poses moved by a share of the way to the bundle's.
 
     run: [n], frames of one number follow each other without a break; nothing is carried from one to another.
-    sound: rows of x whose poses tell how the two head frames lie to each other, and where the difference is known.
+    time: [n] s. sound: rows of x whose poses tell how the two head frames lie to each other, and where the
+    difference is known.
     """
     known = np.isin(bundle.frame, good[sound]) & _well_seen(bundle)
     row = np.searchsorted(good, bundle.frame[known])
@@ -38,17 +39,17 @@ def hold_poses(
         return x
     rotation = Rotation.from_rotvec(bundle.rotation[known]).as_matrix()
     change = _corrections(x[row], rotation, bundle.translation[known].astype(np.float64))
-    step = np.median(np.diff(bundle.frame))
-    ends = np.flatnonzero((np.diff(row) > 1.5 * step) | (np.diff(run[row]) != 0)) + 1
+    step = np.diff(time[row])
+    ends = np.flatnonzero((step > 1.5 * np.median(step)) | (np.diff(run[row]) != 0)) + 1
     stretches: dict[int, Corrections] = {}
     for part in np.split(np.arange(len(row)), ends):
         # Landmarks drift slowly; what changes from one known frame to the next is noise of either.
         smooth = convolve1d(change[part], [0.25, 0.5, 0.25], axis=0, mode="nearest")
-        stretches.setdefault(int(run[row[part[0]]]), []).append((row[part], smooth))
+        stretches.setdefault(int(run[row[part[0]]]), []).append((time[row[part]], smooth))
     out = x.copy()
     for number, found in stretches.items():
         mine = np.flatnonzero(run == number)
-        moved = share * _between(found, mine)
+        moved = share * _between(found, time[mine])
         turned = Rotation.from_rotvec(moved[:, :3]).as_matrix() @ rotation_matrix(x[mine, -6:-3])
         out[mine, -6:-3] = rotation_vector(turned)
         out[mine, -3:] += moved[:, 3:]
@@ -77,13 +78,13 @@ def _corrections(x: F64, rotation: F64, translation: F64) -> F64:
     return np.concatenate([turn, moved - place], axis=1)
 
 
-def _between(stretches: Corrections, rows: Rows) -> F64:
-    """[len(rows), 6] corrections of all rows of one run: linear between those known, none far from all of them."""
-    known = np.concatenate([row for row, _ in stretches])
+def _between(stretches: Corrections, time: F64) -> F64:
+    """[len(time), 6] corrections at all times of one run: linear between those known, none far from all of them."""
+    known = np.concatenate([moment for moment, _ in stretches])
     change = np.concatenate([part for _, part in stretches])
-    far = [edge for row, _ in stretches for edge in (row[0] - FADE, row[-1] + FADE)]
-    far = [edge for edge in far if np.abs(known - edge).min() >= FADE]
-    places = np.concatenate([known, np.array(far, np.int64)])
+    far = [edge for moment, _ in stretches for edge in (moment[0] - FADE_S, moment[-1] + FADE_S)]
+    far = [edge for edge in far if np.abs(known - edge).min() > 0.999 * FADE_S]
+    moments = np.concatenate([known, far])
     values = np.concatenate([change, np.zeros((len(far), 6))])
-    order = np.argsort(places)
-    return np.stack([np.interp(rows, places[order], column) for column in values[order].T], axis=1)
+    order = np.argsort(moments)
+    return np.stack([np.interp(time, moments[order], column) for column in values[order].T], axis=1)

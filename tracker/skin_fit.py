@@ -201,7 +201,7 @@ def _steadied(
     way by the mean of their compliances, which what is soft in one of them makes far from the mean stiffness' inverse.
     """
     shape = subject.energy.shape(subject.identity.astype(np.float64))
-    alone = Smoothness.between(np.arange(len(x)), np.zeros(x.shape[1]))
+    alone = Smoothness.none(*x.shape)
     x, _ = solve_frames(energy, shape, x, alone, steps=subject.photometry.steps)
     drift = (x - anchor).mean(0)
     compliance = np.linalg.inv(energy.linearize(shape, x).hessian).mean(0)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol, Self
 
@@ -16,6 +16,8 @@ from tracker.track import F64
 
 ROUNDS = 4  # of fixing what passes a bound
 GIVE_UP = 1e6  # damping at which no step can help
+STEP_S = 0.04  # between two frames, of which precisions of bends are told
+LEAST_STEP = 0.05  # of that: nearer frames are taken to be so far apart
 CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
 
 
@@ -173,24 +175,42 @@ def schur_step(
 
 @dataclass(frozen=True)
 class Smoothness:
-    """Second differences along time, inside unbroken runs: their precisions [n-2, P].
+    """Bends along time, inside unbroken runs: their precisions [n-2, P].
 
+    bend: [n-2, 3] by which three frames in a row are added up to one. It is their second difference where frames are
+    STEP_S apart; what is farther apart may bend more, as the integral of white noise does: by the power 1.5 of time.
     tolerated: a pose's squared bend, in standard deviations, at which it counts half (Cauchy's loss over all six of its
     numbers): a head that is jerked bends hundreds of times more than usual, and must not be followed late for it.
     """
 
     precision: F64
+    bend: F64
     tolerated: float = np.inf
 
     @classmethod
-    def between(cls, run: NDArray[np.integer], precision: F64, tolerated: float = np.inf) -> Smoothness:
-        """`run` [n]: frames with the same number in a row follow each other without a break. precision: [P]."""
+    def none(cls, frames: int, unknowns: int) -> Smoothness:
+        """Each frame is on its own."""
+        count = max(frames - 2, 0)
+        return cls(np.zeros((count, unknowns)), np.zeros((count, 3)))
+
+    @classmethod
+    def between(
+        cls, run: NDArray[np.integer], time: F64, precision: F64, tolerated: float = np.inf
+    ) -> Smoothness:
+        """Of frames at `time` [n] s, ascending; those of the same number `run` [n] follow each other without a break.
+
+        precision: [P].
+        """
         triple = (run[2:] == run[1:-1]) & (run[1:-1] == run[:-2])
-        return cls(triple[:, None] * precision, tolerated)
+        step = np.maximum(np.diff(time) / STEP_S, LEAST_STEP)
+        before, after = step[:-1], step[1:]
+        bend = np.stack([1 / before, -1 / before - 1 / after, 1 / after], axis=1)
+        bend *= np.sqrt(2 / (before + after))[:, None]
+        return cls(triple[:, None] * precision, bend, tolerated)
 
     def value(self, x: F64) -> float:
         """Energy of x [n, P]."""
-        square = self.precision * _bend(x) ** 2
+        square = self.precision * self._bends(x) ** 2
         pose = square[:, -POSE:].sum(1)
         if np.isfinite(self.tolerated):
             pose = self.tolerated * np.log1p(pose / self.tolerated)
@@ -198,34 +218,41 @@ class Smoothness:
 
     def at(self, x: F64) -> Smoothness:
         """The quadratic that touches it at x [n, P] and is nowhere below."""
-        pose = (self.precision * _bend(x) ** 2)[:, -POSE:].sum(1)
+        pose = (self.precision * self._bends(x) ** 2)[:, -POSE:].sum(1)
         precision = self.precision.copy()
         precision[:, -POSE:] /= 1 + pose[:, None] / self.tolerated
-        return Smoothness(precision)
+        return replace(self, precision=precision, tolerated=np.inf)
 
     def gradient(self, x: F64) -> F64:
         """[n, P]."""
-        bend = self.at(x).precision * _bend(x)
+        pull = self.at(x).precision * self._bends(x)
         out = np.zeros_like(x)
-        out[2:] += bend
-        out[1:-1] -= 2 * bend
-        out[:-2] += bend
+        for rows, weight in self._parts():
+            out[rows] += weight * pull
         return out
 
     def bands(self, n: int) -> tuple[F64, F64, F64]:
         """[n, P] each: a quadratic's Hessian, its diagonal and its couplings of frame i with i + 1 and i + 2."""
         diagonal, first, second = np.zeros((3, n, self.precision.shape[1]))
-        diagonal[2:] += self.precision
-        diagonal[1:-1] += 4 * self.precision
-        diagonal[:-2] += self.precision
-        first[1:-1] -= 2 * self.precision
-        first[:-2] -= 2 * self.precision
-        second[:-2] += self.precision
+        for rows, weight in self._parts():
+            diagonal[rows] += weight**2 * self.precision
+        before, here, after = (weight for _, weight in self._parts())
+        first[:-2] += before * here * self.precision
+        first[1:-1] += here * after * self.precision
+        second[:-2] += before * after * self.precision
         return diagonal, first, second
 
+    def _bends(self, x: F64) -> F64:
+        """[n-2, P] of x [n, P]."""
+        out = np.zeros((len(self.bend), x.shape[1]))
+        for rows, weight in self._parts():
+            out += weight * x[rows]
+        return out
 
-def _bend(x: F64) -> F64:
-    return x[2:] - 2 * x[1:-1] + x[:-2]
+    def _parts(self) -> Iterator[tuple[slice, F64]]:
+        """Of the three frames of each bend: their rows, and their weights [n-2, 1]."""
+        rows = np.s_[:-2], np.s_[1:-1], np.s_[2:]
+        return zip(rows, self.bend.T[..., None])
 
 
 def solve_frames(

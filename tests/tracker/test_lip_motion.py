@@ -9,6 +9,7 @@ from tracker.lip_motion import STRETCH, steadied
 
 FRAMES = 100
 ONE_RUN = np.zeros(FRAMES, np.int64)
+TIME = np.arange(FRAMES) / 25
 
 
 def patterned(width: np.ndarray) -> np.ndarray:
@@ -38,34 +39,47 @@ def apart(width: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def openings() -> tuple[np.ndarray, np.ndarray]:
     """True widths and those read [n, 9] mm, whose errors last for some frames."""
+    return spoken(1)
+
+
+def spoken(rate: int) -> tuple[np.ndarray, np.ndarray]:
+    """True widths and those read [n, 9] mm of the same seconds, at so many times 25 frames a second."""
     rng = np.random.default_rng(2)
-    true = np.repeat(4 + 3 * np.sin(np.arange(FRAMES) / 5)[:, None], 9, axis=1)
-    error = gaussian_filter1d(rng.normal(size=(FRAMES, 9)), 1.5, axis=0)
+    true = np.repeat(4 + 3 * np.sin(np.arange(FRAMES * rate) / rate / 5)[:, None], 9, axis=1)
+    error = gaussian_filter1d(rng.normal(size=true.shape), 1.5 * rate, axis=0)
     return true, true + 0.5 * error / error.std()
 
 
 def test_the_lips_motion_takes_a_third_of_a_reading_error(openings: tuple[np.ndarray, np.ndarray]):
     true, read = openings
-    widths = steadied(apart(read), patterned(true), ONE_RUN)
+    widths = steadied(apart(read), patterned(true), ONE_RUN, TIME)
+    assert (widths - true).std() < 0.67 * (read - true).std()
+
+
+@pytest.mark.parametrize("rate", [2, 4])
+def test_at_a_higher_rate_errors_of_the_same_time_are_taken_as_far(rate: int):
+    true, read = spoken(rate)
+    time = np.arange(len(true)) / (25 * rate)
+    widths = steadied(apart(read), patterned(true), np.zeros(len(true), np.int64), time)
     assert (widths - true).std() < 0.67 * (read - true).std()
 
 
 def test_right_readings_stay(openings: tuple[np.ndarray, np.ndarray]):
     true, _ = openings
-    np.testing.assert_allclose(steadied(apart(true), patterned(true), ONE_RUN), true, atol=0.25)
+    np.testing.assert_allclose(steadied(apart(true), patterned(true), ONE_RUN, TIME), true, atol=0.25)
 
 
 def test_light_that_changes_is_no_motion(openings: tuple[np.ndarray, np.ndarray]):
     true, _ = openings
     flicker = np.where(np.arange(FRAMES) % 4 < 2, 1.0, 0.6)[:, None, None, None]
     dim = (patterned(true) * flicker).astype(np.uint8)
-    np.testing.assert_allclose(steadied(apart(true), dim, ONE_RUN), true, atol=0.25)
+    np.testing.assert_allclose(steadied(apart(true), dim, ONE_RUN, TIME), true, atol=0.25)
 
 
 def test_a_closure_of_one_frame_is_not_smoothed_away():
     true = np.full((FRAMES, 9), 5.0)
     true[50] = 0
-    widths = steadied(apart(true), patterned(true), ONE_RUN)
+    widths = steadied(apart(true), patterned(true), ONE_RUN, TIME)
     assert widths[50].max() < 0.1
     assert widths[[48, 49, 51, 52]].min() > 4.7
 
@@ -74,26 +88,30 @@ def test_a_shut_mouth_is_believed_where_motion_says_otherwise():
     true = np.full((FRAMES, 9), 5.0)
     read = true.copy()
     read[40:60] = 0
-    assert steadied(apart(read), patterned(true), ONE_RUN)[45:55].max() < 0.3
+    assert steadied(apart(read), patterned(true), ONE_RUN, TIME)[45:55].max() < 0.3
 
 
 def test_lips_are_not_followed_across_a_cut_nor_under_a_hand(openings: tuple[np.ndarray, np.ndarray]):
     true, read = openings
     colours = patterned(true)
     run = np.where(np.arange(FRAMES) < 60, 0, 1)
-    both = steadied(apart(read), colours, run)
+    both = steadied(apart(read), colours, run, TIME)
     for part in (slice(0, 60), slice(60, FRAMES)):
-        np.testing.assert_allclose(both[part], steadied(apart(read[part]), colours[part], run[part]))
+        np.testing.assert_allclose(
+            both[part], steadied(apart(read[part]), colours[part], run[part], TIME[part])
+        )
     covered = np.where((np.arange(FRAMES) >= 40) & (np.arange(FRAMES) < 50), -1, 0)
-    np.testing.assert_allclose(steadied(apart(read), colours, covered)[40:50], read[40:50])
+    np.testing.assert_allclose(steadied(apart(read), colours, covered, TIME)[40:50], read[40:50])
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_a_clip_of_few_frames(count: int):
     true = np.full((count, 9), 3.0)
-    np.testing.assert_allclose(steadied(apart(true), patterned(true), ONE_RUN[:count]), true, atol=0.1)
+    np.testing.assert_allclose(
+        steadied(apart(true), patterned(true), ONE_RUN[:count], TIME[:count]), true, atol=0.1
+    )
 
 
 def test_edges_that_cross_are_shut():
     crossed = np.full((3, 9), -0.5)
-    assert steadied(apart(crossed), patterned(np.zeros((3, 9))), ONE_RUN[:3]).max() < 0.05
+    assert steadied(apart(crossed), patterned(np.zeros((3, 9))), ONE_RUN[:3], TIME[:3]).max() < 0.05

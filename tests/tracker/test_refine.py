@@ -170,7 +170,7 @@ def test_lips_are_not_followed_across_pictures_that_are_missing(film: Film, monk
     told: list[np.ndarray] = []
     monkeypatch.setattr(refine, "lip_edges", lambda along, marks, sound: marks[..., 1:3])
     monkeypatch.setattr(
-        refine, "steadied", lambda edges, along, run: told.append(run) or np.ones((len(run), 9))
+        refine, "steadied", lambda edges, along, run, time: told.append(run) or np.ones((len(run), 9))
     )
     one_shot, time = np.zeros(FRAMES, np.int32), film.landmarks.time
     widths = _read_widths(lines, colours, good, one_shot, time, np.arange(1, FRAMES))

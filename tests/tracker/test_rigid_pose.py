@@ -5,20 +5,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tracker.energy import rotation_matrix, rotation_vector
-from tracker.rigid_pose import FADE, hold_poses
+from tracker.rigid_pose import FADE_S, hold_poses
 from tracker.track import Bundle
 
 FRAMES, STEP = 90, 3
 GOOD = np.arange(FRAMES)
 RUN = np.zeros(FRAMES, np.int64)
+TIME = np.arange(FRAMES) / 25
 
 
 @pytest.fixture
 def truth() -> np.ndarray:
     """[n, 8] two weights and a pose that swings."""
-    t = np.arange(FRAMES) / 25
-    turn = np.radians([6.0, 15.0, 3.0]) * np.sin(np.outer(t, [1.1, 1.6, 0.7]))
-    place = [0.0, 0.02, 0.6] + 0.02 * np.sin(np.outer(t, [1.3, 0.8, 1.0]))
+    turn = np.radians([6.0, 15.0, 3.0]) * np.sin(np.outer(TIME, [1.1, 1.6, 0.7]))
+    place = [0.0, 0.02, 0.6] + 0.02 * np.sin(np.outer(TIME, [1.3, 0.8, 1.0]))
     return np.concatenate([np.full((FRAMES, 2), 0.3), turn, place], axis=1)
 
 
@@ -53,7 +53,7 @@ def error_deg(x: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def test_poses_come_to_the_bundle_and_weights_stay(truth):
     start = drifted(truth)
-    held = hold_poses(start, bundle_of(truth, GOOD[::STEP]), GOOD, RUN, GOOD, 1.0)
+    held = hold_poses(start, bundle_of(truth, GOOD[::STEP]), GOOD, RUN, TIME, GOOD, 1.0)
     assert error_deg(start, truth).mean() > 1.0
     assert error_deg(held, truth).mean() < 0.1
     assert np.abs(held[:, -3:] - truth[:, -3:]).max() < 0.002
@@ -63,17 +63,19 @@ def test_poses_come_to_the_bundle_and_weights_stay(truth):
 def test_frames_of_the_clip_that_are_not_measured_are_skipped(truth):
     good = np.setdiff1d(GOOD, [0, 1, 30, 31])
     start = drifted(truth)[good]
-    held = hold_poses(start, bundle_of(truth, GOOD[::STEP]), good, RUN[good], np.arange(len(good)), 1.0)
+    held = hold_poses(
+        start, bundle_of(truth, GOOD[::STEP]), good, RUN[good], TIME[good], np.arange(len(good)), 1.0
+    )
     assert error_deg(held, truth[good]).mean() < 0.1
 
 
 def test_nothing_is_carried_over_a_cut_nor_far_from_a_window(truth):
     start = drifted(truth)
     bundle = bundle_of(truth, GOOD[:30:STEP])
-    held = hold_poses(start, bundle, GOOD, (GOOD >= 30).astype(np.int64), GOOD, 1.0)
+    held = hold_poses(start, bundle, GOOD, (GOOD >= 30).astype(np.int64), TIME, GOOD, 1.0)
     np.testing.assert_array_equal(held[30:], start[30:])
-    held = hold_poses(start, bundle, GOOD, RUN, GOOD, 1.0)
-    assert np.abs(held - start)[30 + FADE :].max() < 1e-12
+    held = hold_poses(start, bundle, GOOD, RUN, TIME, GOOD, 1.0)
+    assert np.abs(held - start)[(TIME - TIME[27]) > FADE_S].max() < 1e-12
     step = np.diff(held[:, 2:5] - start[:, 2:5], axis=0)
     assert np.degrees(np.abs(step)).max() < 0.3
 
@@ -81,19 +83,21 @@ def test_nothing_is_carried_over_a_cut_nor_far_from_a_window(truth):
 def test_without_a_bundle_poses_stay(truth):
     start = drifted(truth)
     for frames in (GOOD[:0], GOOD[:7]):
-        np.testing.assert_array_equal(hold_poses(start, bundle_of(truth, frames), GOOD, RUN, GOOD), start)
+        np.testing.assert_array_equal(
+            hold_poses(start, bundle_of(truth, frames), GOOD, RUN, TIME, GOOD), start
+        )
 
 
 def test_a_place_whose_depth_is_uncertain_moves_nothing_sideways(truth):
     start, random = drifted(truth), np.random.default_rng(0)
     start[:, -1] += np.cumsum(random.normal(0, 0.002, FRAMES))  # landmarks see depth badly
-    held = hold_poses(start, bundle_of(truth, GOOD[::STEP]), GOOD, RUN, GOOD, 1.0)
+    held = hold_poses(start, bundle_of(truth, GOOD[::STEP]), GOOD, RUN, TIME, GOOD, 1.0)
     assert np.abs(held[:, -3:-1] - truth[:, -3:-1]).max() < 0.001
 
 
 def test_a_share_of_the_way_leaves_the_rest_of_the_error(truth):
     start, bundle = drifted(truth), bundle_of(truth, GOOD[::STEP])
-    held = hold_poses(start, bundle, GOOD, RUN, GOOD, 0.5)
+    held = hold_poses(start, bundle, GOOD, RUN, TIME, GOOD, 0.5)
     assert error_deg(held, truth).mean() == pytest.approx(error_deg(start, truth).mean() / 2, rel=0.05)
 
 
@@ -104,6 +108,17 @@ def test_a_frame_that_sees_few_of_the_points_tells_nothing(truth):
     seen = np.where(np.arange(len(frames)) == 15, 12, 100)
     observations = np.zeros((seen.sum(), 4), np.float32)
     observations[:, 0] = np.repeat(frames, seen)
-    held = hold_poses(start, replace(bundle, observations=observations), GOOD, RUN, GOOD, 1.0)
+    held = hold_poses(start, replace(bundle, observations=observations), GOOD, RUN, TIME, GOOD, 1.0)
     assert error_deg(held, truth).max() < 1.0
-    assert error_deg(hold_poses(start, bundle, GOOD, RUN, GOOD, 1.0), truth).max() > 2.0
+    assert error_deg(hold_poses(start, bundle, GOOD, RUN, TIME, GOOD, 1.0), truth).max() > 2.0
+
+
+def test_between_frames_corrections_go_by_the_time_and_not_by_how_many_frames_there_are(truth):
+    kept = np.random.default_rng(1).random(FRAMES) < 0.6
+    kept[::STEP] = True
+    good = np.flatnonzero(kept)
+    start, bundle = drifted(truth), bundle_of(truth, GOOD[::STEP])
+    whole = hold_poses(start, bundle, GOOD, RUN, TIME, GOOD, 1.0)
+    some = hold_poses(start[good], bundle, good, RUN[good], TIME[good], np.arange(len(good)), 1.0)
+    change = whole[good] - start[good]
+    np.testing.assert_allclose(some - start[good], change, atol=0.002 * np.abs(change).max())

@@ -2,10 +2,12 @@ import numpy as np
 import pytest
 
 from tracker.energy import POSE, Quadratic
-from tracker.solver import Bounds, Smoothness, band_step, bounded_step, schur_step
+from tracker.solver import STEP_S, Bounds, Smoothness, band_step, bounded_step, schur_step
 
 FRAMES, WEIGHTS, IDENTITIES = 7, 3, 4
 UNKNOWNS = WEIGHTS + POSE
+EVEN = STEP_S * np.arange(FRAMES)
+UNEVEN = STEP_S * np.array([0.0, 0.5, 2.0, 3.0, 3.4, 5.4, 6.4])
 UNIT = Bounds(np.zeros(1), np.ones(1))
 
 
@@ -14,14 +16,20 @@ def random_blocks(rng: np.random.Generator, size: int) -> np.ndarray:
     return root @ root.transpose(0, 2, 1) + np.eye(size)
 
 
-def second_differences(run: np.ndarray) -> np.ndarray:
-    """[m, FRAMES], one row for each three frames in a row of the same run."""
+def bends(run: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """[m, FRAMES], one row for each three frames in a row of the same run.
+
+    How far the third lies off the line through the first two, over the deviation of that for the integral of white
+    noise, by that of frames STEP_S apart.
+    """
     rows = []
     for i in range(FRAMES - 2):
         if run[i] == run[i + 1] == run[i + 2]:
+            before, after = np.diff(time[i : i + 3]) / STEP_S
             row = np.zeros(FRAMES)
-            row[i : i + 3] = [1, -2, 1]
-            rows.append(row)
+            row[i : i + 3] = [after / before, -1 - after / before, 1]
+            variance = after**2 * before / 3 + after**3 / 3
+            rows.append(row * np.sqrt((1 / 3 + 1 / 3) / variance))
     return np.array(rows).reshape(-1, FRAMES)
 
 
@@ -30,28 +38,50 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def smoothness(rng: np.random.Generator, run: np.ndarray) -> tuple[Smoothness, np.ndarray]:
+def smoothness(
+    rng: np.random.Generator, run: np.ndarray, time: np.ndarray = EVEN
+) -> tuple[Smoothness, np.ndarray]:
     precision = rng.uniform(0.5, 2.0, UNKNOWNS)
-    bend = second_differences(run)
-    return Smoothness.between(run, precision), np.kron(bend.T @ bend, np.diag(precision))
+    bend = bends(run, time)
+    return Smoothness.between(run, time, precision), np.kron(bend.T @ bend, np.diag(precision))
 
 
-def test_smoothness_is_the_quadratic_form_and_its_gradient(rng):
-    term, dense = smoothness(rng, np.array([0, 0, 0, 0, 1, 1, 1]))
+@pytest.mark.parametrize("time", [EVEN, UNEVEN])
+def test_smoothness_is_the_quadratic_form_and_its_gradient(rng, time):
+    term, dense = smoothness(rng, np.array([0, 0, 0, 0, 1, 1, 1]), time)
     x = rng.normal(size=(FRAMES, UNKNOWNS))
     assert term.value(x) == pytest.approx(0.5 * x.ravel() @ dense @ x.ravel())
     np.testing.assert_allclose(term.gradient(x).ravel(), dense @ x.ravel(), atol=1e-12)
 
 
+def test_frames_an_even_step_apart_bend_by_their_second_difference():
+    np.testing.assert_allclose(bends(np.zeros(FRAMES, int), EVEN)[2, 2:5], [1, -2, 1])
+
+
+def test_even_motion_costs_nothing_whenever_it_is_filmed(rng):
+    term = Smoothness.between(np.zeros(FRAMES, int), UNEVEN, np.ones(UNKNOWNS))
+    x = rng.normal(size=UNKNOWNS) + np.outer(UNEVEN, rng.normal(size=UNKNOWNS))
+    assert term.value(x) == pytest.approx(0, abs=1e-20)
+
+
+def test_pictures_of_almost_the_same_time_leave_the_step_solvable(rng):
+    time = EVEN.copy()
+    time[3] = time[2] + 1e-9
+    term = Smoothness.between(np.zeros(FRAMES, int), time, np.ones(UNKNOWNS))
+    none, still = np.zeros((FRAMES, UNKNOWNS), bool), np.zeros((FRAMES, UNKNOWNS))
+    step = band_step(still + 1.0, random_blocks(rng, UNKNOWNS), term, 0.0, none, still)[1]
+    assert 0 < np.abs(step).max() < 10
+
+
 def test_tolerant_smoothness_slopes_as_it_rises(rng):
-    term = Smoothness.between(np.zeros(FRAMES, int), rng.uniform(0.5, 2.0, UNKNOWNS), tolerated=2.0)
+    term = Smoothness.between(np.zeros(FRAMES, int), EVEN, rng.uniform(0.5, 2.0, UNKNOWNS), tolerated=2.0)
     x, way = rng.normal(size=(2, FRAMES, UNKNOWNS))
     rise = (term.value(x + 1e-6 * way) - term.value(x - 1e-6 * way)) / 2e-6
     assert (term.gradient(x) * way).sum() == pytest.approx(rise, rel=1e-6)
 
 
 def test_the_quadratic_at_a_point_has_its_slope_and_is_nowhere_below(rng):
-    term = Smoothness.between(np.zeros(FRAMES, int), rng.uniform(0.5, 2.0, UNKNOWNS), tolerated=2.0)
+    term = Smoothness.between(np.zeros(FRAMES, int), EVEN, rng.uniform(0.5, 2.0, UNKNOWNS), tolerated=2.0)
     x, elsewhere = rng.normal(size=(2, FRAMES, UNKNOWNS))
     touching = term.at(x)
     np.testing.assert_allclose(touching.gradient(x), term.gradient(x))
@@ -61,7 +91,7 @@ def test_the_quadratic_at_a_point_has_its_slope_and_is_nowhere_below(rng):
 
 
 def test_a_jerk_of_the_head_costs_next_to_nothing_more_and_one_of_a_weight_all_of_it():
-    term = Smoothness.between(np.zeros(FRAMES, int), np.ones(UNKNOWNS), tolerated=9.0)
+    term = Smoothness.between(np.zeros(FRAMES, int), EVEN, np.ones(UNKNOWNS), tolerated=9.0)
     jerked, spoken = np.zeros((2, FRAMES, UNKNOWNS))
     jerked[3:, -6], spoken[3:, 0] = 100.0, 100.0
     assert term.value(jerked) < 0.01 * term.value(spoken)
@@ -69,8 +99,9 @@ def test_a_jerk_of_the_head_costs_next_to_nothing_more_and_one_of_a_weight_all_o
 
 
 @pytest.mark.parametrize("run", [[0, 0, 0, 0, 0, 0, 0], [0, 0, 0, 1, 1, 1, 1], [0, 1, 1, 2, 2, 3, 3]])
-def test_band_step_solves_the_dense_system(rng, run):
-    term, dense = smoothness(rng, np.array(run))
+@pytest.mark.parametrize("time", [EVEN, UNEVEN])
+def test_band_step_solves_the_dense_system(rng, run, time):
+    term, dense = smoothness(rng, np.array(run), time)
     gradient, blocks = rng.normal(size=(FRAMES, UNKNOWNS)), random_blocks(rng, UNKNOWNS)
     for frame in range(FRAMES):
         part = slice(frame * UNKNOWNS, (frame + 1) * UNKNOWNS)
