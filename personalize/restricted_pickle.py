@@ -258,8 +258,10 @@ def _view(
 
 
 def _matrix(kind: type, state: dict[str, Any]) -> Any:
-    """The sparse matrix of scipy's own state, its indices checked."""
+    """The sparse matrix of scipy's own state, its size and indices checked: whoever reads it makes it dense."""
     data, shape = state["data"], state["_shape"]
+    if math.prod(shape) * data.dtype.itemsize > LARGEST_PICKLE_BYTES:
+        raise ValueError(f"a sparse matrix of shape {shape} is larger than any head's")
     if kind is _Coo:
         coords = state["coords"] if "coords" in state else (state["row"], state["col"])
         return sparse.coo_matrix((data, coords), shape=shape)

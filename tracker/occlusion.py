@@ -111,18 +111,24 @@ def regions(place: NDArray[np.floating]) -> list[NDArray[np.intp]]:
 
 def _strangeness(colour: U8) -> F64:
     """[n] 1 - correlation of a region's colours [n, R, 3] with the nearest pattern of the face's own."""
-    logs = np.log(colour.astype(np.float64) + DARK)
-    values = (logs - logs.mean(1, keepdims=True)).reshape(len(logs), -1)
-    learned = np.unique(np.linspace(0, len(values) - 1, LEARNED).round().astype(int))
-    taken, patterns = learned, np.zeros((0, values.shape[1]))
-    mean = np.median(values[learned], axis=0)
+    learned = np.unique(np.linspace(0, len(colour) - 1, LEARNED).round().astype(int))
+    values = _contrasts(colour[learned])
+    patterns, mean = np.zeros((0, values.shape[1])), np.median(values, axis=0)
     for _ in range(4):
-        strange = _unlike(values[learned], mean, patterns)
-        taken = learned[np.argsort(strange, kind="stable")[: max(1, round(TRUSTED * len(learned)))]]
+        strange = _unlike(values, mean, patterns)
+        taken = np.argsort(strange, kind="stable")[: max(1, round(TRUSTED * len(learned)))]
         mean = values[taken].mean(0)
         patterns = np.linalg.svd(values[taken] - mean, full_matrices=False)[2]
         patterns = patterns[: min(PATTERNS, len(taken) // FRAMES_PER_PATTERN)]
-    return _unlike(values, mean, patterns)
+    # Some at a time: of all frames of an hour these would fill gigabytes.
+    parts = (colour[start : start + LEARNED] for start in range(0, len(colour), LEARNED))
+    return np.concatenate([_unlike(_contrasts(part), mean, patterns) for part in parts])
+
+
+def _contrasts(colour: U8) -> F64:
+    """[n, 3 R] log colours of a region [n, R, 3] about their mean."""
+    logs = np.log(colour.astype(np.float64) + DARK)
+    return (logs - logs.mean(1, keepdims=True)).reshape(len(logs), -1)
 
 
 def _unlike(values: F64, mean: F64, patterns: F64) -> F64:

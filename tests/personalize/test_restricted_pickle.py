@@ -228,6 +228,12 @@ def test_indices_out_of_range_are_found(tmp_path: Path) -> None:
         read_pickle(written(tmp_path, pickle.dumps({"m": matrix})))
 
 
+@pytest.mark.parametrize("kind", [sparse.coo_matrix, sparse.csc_matrix, sparse.csr_matrix])
+def test_a_sparse_matrix_that_would_fill_the_memory_is_refused(tmp_path: Path, kind: type) -> None:
+    with pytest.raises(UserError, match=r"not a readable pickle.*shape \(200000, 200000\)"):
+        read_pickle(written(tmp_path, pickle.dumps({"m": kind((200_000, 200_000))})))
+
+
 def test_missing_large_and_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UserError, match="there is no file"):
         read_pickle(tmp_path / "none.pkl")
