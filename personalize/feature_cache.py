@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from model.speech import SpeechEncoder
 from personalize.files import read_npz, write_atomic
+from personalize.user_arrays import DAMAGED
 
 LIMIT_BYTES = 1 << 30
 # Bumped when an encoder of the same name gives other features: it is part of every key.
@@ -66,7 +66,7 @@ def _read(path: Path, width: int) -> Features | None:
         content = read_npz(path)
         features, times = content["features"], content["times"]
         os.utime(path)
-    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile):
+    except (KeyError, *DAMAGED):
         return None
     return (features, times) if features.shape == (len(times), width) else None
 

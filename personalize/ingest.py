@@ -172,7 +172,12 @@ def _look_for_cuts(
         if progress is not None:
             progress(min(len(rows), expected), 2 * expected)
     times, changes, same, damaged = zip(*rows)
-    return np.array(times), np.array(changes), repeated(np.array(changes), np.array(same)), np.array(damaged)
+    return (
+        np.array(times),
+        np.array(changes),
+        repeated(np.array(times), np.array(changes), np.array(same)),
+        np.array(damaged),
+    )
 
 
 def _follow_faces(media: MediaInfo, segment: NDArray[np.int32], progress: Progress) -> list[Tracklet]:

@@ -51,7 +51,7 @@ def frame_reasons(frames: Frames, track: Track, doubts: Sequence[str], least: fl
     """
     known = (frames.reasons[index] for index in frames.reason)
     return [
-        reason if reason != "ok" else "no_face" if not valid else doubt if sure < least else "ok"
+        reason if reason != "ok" else "no_face" if not valid else "ok" if sure >= least else doubt
         for reason, valid, doubt, sure in zip(known, track.valid, doubts, track.confidence)
     ]
 

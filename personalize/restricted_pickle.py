@@ -2,15 +2,18 @@
 
 A pickle is a program that calls whatever it names. Here every name it may use leads to an inert holder that only
 keeps what it is given; the data is built from the holders afterwards, with lengths checked. So neither the file nor
-numpy's own unpickling functions decide what runs, and no memory is taken that the file does not fill.
+numpy's own unpickling functions decide what runs, and no memory is taken that the file does not fill (of a sparse
+matrix, which is made dense, none above a limit).
 """
 
 from __future__ import annotations
 
 import io
 import math
+import operator
 import pickle
 import re
+import struct
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,11 +25,12 @@ from scipy import sparse
 from personalize.errors import UserError
 
 LARGEST_PICKLE_BYTES = 2 << 30
+LARGEST_SPARSE_BYTES = 256 << 20  # of a sparse matrix made dense in double precision
 DTYPE = re.compile(r"[<>|=]?[biufcSU]\d{1,6}")
 # What a damaged or hostile file makes the interpreter of pickles, or the building after it, raise.
 BROKEN = (
     pickle.UnpicklingError, ValueError, TypeError, LookupError, EOFError, AttributeError, ImportError,
-    OverflowError, RecursionError, MemoryError,
+    OverflowError, RecursionError, MemoryError, struct.error,
 )  # fmt: skip
 
 
@@ -260,8 +264,9 @@ def _view(
 def _matrix(kind: type, state: dict[str, Any]) -> Any:
     """The sparse matrix of scipy's own state, its size and indices checked: whoever reads it makes it dense."""
     data, shape = state["data"], state["_shape"]
-    if math.prod(shape) * data.dtype.itemsize > LARGEST_PICKLE_BYTES:
-        raise ValueError(f"a sparse matrix of shape {shape} is larger than any head's")
+    rows, columns = (operator.index(size) for size in shape)
+    if min(rows, columns) < 0 or rows * columns * 8 > LARGEST_SPARSE_BYTES:
+        raise ValueError(f"a sparse matrix of shape {rows, columns} is none of a head's")
     if kind is _Coo:
         coords = state["coords"] if "coords" in state else (state["row"], state["col"])
         return sparse.coo_matrix((data, coords), shape=shape)

@@ -22,11 +22,20 @@ from tracker.refine import Refined
 from tracker.track import Bundle, Camera, Landmarks, Track
 
 SCHEMA = 1
+VIDEO_KEYS = {"name", "path", "sha256"}
 
 
 def tool_version() -> str:
     """Version of the installed package."""
     return version("personalize")
+
+
+def _is_run(state: Any) -> bool:
+    """Whether this is what a run.json of this version holds."""
+    if not isinstance(state, dict) or state.get("schema") != SCHEMA:
+        return False
+    parts = all(isinstance(state.get(key), dict) for key in ("video", "settings", "stages"))
+    return parts and state["video"].keys() >= VIDEO_KEYS
 
 
 class RunFolder:
@@ -66,7 +75,7 @@ class RunFolder:
             raise UserError(f"{path}: no run.json there; give a folder made by `personalize VIDEO`") from None
         except (OSError, ValueError) as error:
             raise UserError(f"{path}/run.json: cannot be read ({error})") from None
-        if not isinstance(state, dict) or state.get("schema") != SCHEMA:
+        if not _is_run(state):
             raise UserError(
                 f"{path}/run.json: not a run of this version of personalize; choose another --out"
             )

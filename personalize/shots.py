@@ -26,6 +26,10 @@ CUT_LEVEL, CUT_RATIO, CUT_WINDOW_S = 1.5, 1.9, 0.28
 SAME_LEVEL = 1.0  # grey levels: no pixel of the thumbnail changes by more in a repeated picture
 # One that was coded anew changes by less than this (mean), and by so small a share of what pictures around it do.
 CODED_LEVEL, CODED_SHARE = 0.12, 0.15
+REPEATED_S = (
+    0.085  # within which the same picture may be shown again and again, and there is a new one on either side
+)
+MOST_WINDOW = 100  # pictures: broken time stamps may lie any number to the second
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -56,24 +60,28 @@ def difference(grey: U8, last: U8) -> tuple[float, bool]:
     return float(change.mean()), bool(change.max() <= SAME_LEVEL)
 
 
-def repeated(change: F64, same: Bool) -> Bool:
+def repeated(time: F64, change: F64, same: Bool) -> Bool:
     """[T] pictures that repeat the one before: those that are the `same`, and those coded as if they were new ones.
 
-    change: [T], see `difference`. Of film at 24 pictures a second in a file of 30 every fifth does. Where nothing moves
-    all change as little, and none is left out.
+    time: [T] s. change: [T], see `difference`. Of film at 24 pictures a second in a file of 30 every fifth does, of 12
+    in 60 four in a row. Where nothing moves all change as little, and none is left out.
     """
-    padded = np.pad(change, 2)
-    before, after = np.maximum(padded[1:-3], padded[:-4]), np.maximum(padded[3:-1], padded[4:])
+    reach = min(max(2, int(REPEATED_S / _usual_step(time))), MOST_WINDOW)
+    padded = np.pad(change, reach)
+    before, after = (
+        np.max([padded[reach + way * step :][: len(change)] for step in range(1, reach + 1)], axis=0)
+        for way in (-1, 1)
+    )
     return same | ((change < CODED_LEVEL) & (change < CODED_SHARE * np.minimum(before, after)))
 
 
 def find_shots(time: F64, change: F64) -> NDArray[np.int32]:
     """Number [T] of the uninterrupted shot of each frame, after its `change` [T] (see `difference`)."""
     step = np.diff(time, prepend=time[0] - 1.0)
-    typical = float(np.median(step[1:])) if len(time) > 1 else 1.0
+    typical = _usual_step(time)
     # Pictures that are further apart differ more without any cut.
     rate = change / np.maximum(1.0, step / typical)
-    window = max(3, round(CUT_WINDOW_S / typical))
+    window = min(max(3, round(CUT_WINDOW_S / typical)), MOST_WINDOW)
     padded = np.pad(rate, window, mode="reflect" if len(rate) > window else "edge")
     around = np.stack([padded[i : i + len(rate)] for i in range(2 * window + 1) if i != window])
     # The second largest, so that two cuts near each other are both found.
@@ -81,6 +89,11 @@ def find_shots(time: F64, change: F64) -> NDArray[np.int32]:
     first = (step > MAX_GAP_S) | ((rate > CUT_LEVEL) & (rate > CUT_RATIO * usual))
     first[0] = True
     return (np.cumsum(first) - 1).astype(np.int32)
+
+
+def _usual_step(time: F64) -> float:
+    """s from one picture to the next."""
+    return float(np.median(np.diff(time))) if len(time) > 1 else 1.0
 
 
 def usable_seconds(frames: Frames) -> float:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from personalize.errors import UserError
 from personalize.restricted_pickle import LARGEST_PICKLE_BYTES, build_pickle
-from personalize.user_arrays import read_user_npz
+from personalize.user_arrays import DAMAGED, read_user_npz
 from tracker.head import HeadModel
 from tracker.track import F64
 
@@ -30,7 +30,7 @@ VHAP_KEYS = ("rotation", "translation", "neck_pose", "jaw_pose", "eyes_pose", "s
              "image_size")  # fmt: skip
 VHAP_NAME = re.compile(r"tracked_flame_params(?:_(\d+))?\.npz")
 # What an array that is missing, or of another shape or kind than expected, raises.
-WRONG = (LookupError, TypeError, ValueError, AttributeError)
+WRONG = (LookupError, TypeError, ValueError, OverflowError, AttributeError)
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,15 @@ def read_tracked(folder: Path, head: HeadModel) -> TrackedFace:
 
 
 def matrix_of_6d(six: NDArray[np.floating]) -> F64:
-    """[.., 6] -> [.., 3, 3]: the first two rows, made orthonormal, and their cross product (Zhou et al. 2019)."""
+    """[.., 6] -> [.., 3, 3]: the first two rows, made orthonormal, and their cross product (Zhou et al. 2019).
+
+    NaN of two rows that span no plane.
+    """
     first, second = six[..., :3].astype(np.float64), six[..., 3:].astype(np.float64)
-    first = first / np.linalg.norm(first, axis=-1, keepdims=True)
-    second = second - (first * second).sum(-1, keepdims=True) * first
-    second = second / np.linalg.norm(second, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        first = first / np.linalg.norm(first, axis=-1, keepdims=True)
+        second = second - (first * second).sum(-1, keepdims=True) * first
+        second = second / np.linalg.norm(second, axis=-1, keepdims=True)
     return np.stack([first, second, np.cross(first, second)], axis=-2)
 
 
@@ -92,7 +96,7 @@ def _metrical(paths: list[Path], head: HeadModel) -> TrackedFace:
 
     The eyelids' two weights are of shapes that FLAME does not hold: left out.
     """
-    numbers = [int(path.stem) if path.stem.isdigit() else -1 for path in paths]
+    numbers = [int(path.stem) if path.stem.isdecimal() else -1 for path in paths]
     if numbers != list(range(numbers[0], numbers[0] + len(paths))):
         raise UserError(
             f"{paths[0].parent}: the numbers of its .frame files have gaps; track the video again"
@@ -109,14 +113,20 @@ def _metrical(paths: list[Path], head: HeadModel) -> TrackedFace:
     half = min(height, width) / 2
     focal = np.median(stack("camera", "fl", 1)) * half
     principal = np.array([width, height]) / 2 - np.median(stack("camera", "pp", 2), axis=0) * half
-    view = matrix_of_6d(stack("camera", "R", 6)).transpose(0, 2, 1)
-    six = stack("flame", "eyes", 12).reshape(-1, 2, 6)
+
+    def turns(group: str, name: str, count: int = 1) -> F64:
+        matrices = matrix_of_6d(stack(group, name, 6 * count).reshape(len(frames), count, 6))
+        if not np.isfinite(matrices).all():
+            raise UserError(f"{where}: {group}.{name} holds what is no rotation; track the video again")
+        return matrices
+
+    view = turns("camera", "R")[:, 0].transpose(0, 2, 1)
     return TrackedFace(
         identity=np.median(stack("flame", "shape", len(head.identity_basis)), axis=0),
         expression=stack("flame", "exp", len(head.expression_basis)),
-        jaw=_axis_angle(matrix_of_6d(stack("flame", "jaw", 6))),
+        jaw=_axis_angle(turns("flame", "jaw")[:, 0]),
         neck=np.zeros((len(frames), 3)),
-        eyes=_axis_angle(matrix_of_6d(six)),
+        eyes=_axis_angle(turns("flame", "eyes", 2)),
         rotation=PYTORCH3D_TO_OPENCV @ view,
         translation=stack("camera", "t", 3) @ PYTORCH3D_TO_OPENCV,
         focal=float(focal),
@@ -172,7 +182,7 @@ def _frame_file(path: Path) -> dict[Any, Any]:
                     f"{path} unpacks to more than {LARGEST_PICKLE_BYTES >> 30} GB; is it another file?"
                 )
             content = archive.read(name)
-    except (OSError, StopIteration, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+    except (StopIteration, *DAMAGED) as error:
         raise UserError(f"{path} is not a .frame file of metrical-tracker; track the video again") from error
     return build_pickle(path, content)
 

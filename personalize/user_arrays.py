@@ -1,8 +1,11 @@
-"""Arrays from a `.npz` that somebody else made: never unpickled, sizes checked before anything is allocated."""
+"""Arrays from a `.npz` that somebody else made: never unpickled, and no more unpacked than a head may need."""
 
 from __future__ import annotations
 
+import lzma
+import tokenize
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,11 @@ from numpy.typing import NDArray
 from personalize.errors import UserError
 
 LARGEST_ARRAYS_BYTES = 2 << 30
+# What a damaged archive, or the header of an array in it, makes its readers raise.
+DAMAGED = (
+    OSError, ValueError, EOFError, MemoryError, OverflowError, RuntimeError, SyntaxError, tokenize.TokenError,
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError,
+)  # fmt: skip
 
 
 def read_user_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:
@@ -28,7 +36,7 @@ def read_user_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.ge
             if missing:
                 raise UserError(f"{path} lacks {', '.join(missing)}; is it another file?")
             return {name: file[name] for name in names}
-    except (OSError, ValueError, EOFError, MemoryError, zipfile.BadZipFile) as error:
+    except DAMAGED as error:
         reason = " ".join(str(error).split())[:120]
         raise UserError(
             f"{path} is not a readable .npz of plain arrays ({reason}); get the file again"

@@ -52,12 +52,17 @@ class Skin:
         return len(self.rest)
 
 
-def skin_of(head: HeadModel, model: LandmarkModel, identity: F32) -> Skin:
-    """Points spread evenly over a subject's face; eyes, eyelids and the inside of the mouth are left out."""
+def skin_triangles(head: HeadModel) -> NDArray[np.int64]:
+    """Those of a head's faces that are skin; eyes, eyelids and the inside of the mouth are left out."""
     inside = np.concatenate([head.regions[name] for name in INSIDE if name in head.regions])
     inside = np.union1d(np.setdiff1d(inside, head.regions["lips"]), head.behind_lips())
     bare = np.setdiff1d(head.regions["face"], inside)
-    triangles = np.flatnonzero(np.isin(head.faces, bare).all(1))
+    return np.flatnonzero(np.isin(head.faces, bare).all(1))
+
+
+def skin_of(head: HeadModel, model: LandmarkModel, identity: F32) -> Skin:
+    """Points spread evenly over a subject's face."""
+    triangles = skin_triangles(head)
     neutral = head.vertices(identity, np.zeros(len(head.expression_basis), np.float32))
     chosen, share = _spread(neutral[head.faces[triangles]])
     corners = head.faces[triangles[chosen]]

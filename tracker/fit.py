@@ -25,7 +25,7 @@ from tracker.energy import (
     visibility,
 )
 from tracker.gaze import eye_rotations
-from tracker.key_frames import key_frames
+from tracker.key_frames import KeyFrames, key_frames
 from tracker.solver import Smoothness, solve_frames, solve_subject
 from tracker.track import F32, F64, Camera, Landmarks, Track, TrackError
 
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 MIN_PRESENCE = 0.5
 LEAST_EVIDENCE = 0.02  # of a covered frame: enough to hold a pose where no neighbour does
 LIP_BIAS = 0.001  # m
-MISSING = 2.5  # times the usual time between measured frames: with one or two missing, the next still follows
+# Times the usual time between measured frames, and at least so long: what is missing does not end a run sooner.
+MISSING, MISSING_S = 2.5, 0.15
 
 Frames = NDArray[np.int64]
 
@@ -64,12 +65,12 @@ def fit_track(
     observed = camera.lens.points(landmarks.points[good][..., :2])
     energy, start = _start(model, weights, camera, observed, landmarks.points[good])
     share, sound = _share(evidence, good), trusted(evidence, good)
-    rest, other = (sound[rows] for rows in key_frames(observed[sound], energy.px_per_m[sound]))
-    energy = with_lips_shut(energy, start, rest)
-    identity = fit_identity(energy, start, (rest, other))
+    keys = key_frames(observed[sound], energy.px_per_m[sound]).of(sound)
+    energy = with_lips_shut(energy, start, keys.rest)
+    identity = fit_identity(energy, start, keys)
     followed = replace(energy, visible=energy.visible * share[:, None])
     smoothness = smoothness_between(energy, landmarks.time, good, segment)
-    x, _ = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
+    x = solve_frames(followed, energy.shape(identity), start, smoothness, progress=progress)
     return make_track(landmarks, camera, head, energy, observed, identity, x, good)
 
 
@@ -156,13 +157,17 @@ def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
     return replace(energy, model=replace(model, mean=mean, touch=touch))
 
 
-def fit_identity(energy: Energy, start: F64, keys: tuple[Frames, Frames]) -> F64:
-    """[Ki] the subject, from frames at rest, whose expressions are held near zero, and from others."""
-    rest, other = keys
-    frames = np.concatenate([rest, other])
-    chosen = energy.select(frames)
-    chosen.strictness[: len(rest)] *= energy.weights.rest
-    return solve_subject(chosen, np.zeros(len(energy.model.identity)), start[frames]).identity
+def fit_identity(energy: Energy, start: F64, keys: KeyFrames) -> F64:
+    """[Ki] the subject, from the key frames at x `start` [n, P]."""
+    chosen = at_ease(energy.select(keys.rows), keys)
+    return solve_subject(chosen, np.zeros(len(energy.model.identity)), start[keys.rows]).identity
+
+
+def at_ease(energy: Energy, keys: KeyFrames) -> Energy:
+    """The energy of the key frames, whose expressions are held near zero where they are at rest."""
+    strictness = energy.strictness.copy()
+    strictness[: len(keys.rest)] *= energy.weights.rest**keys.ease
+    return replace(energy, strictness=strictness)
 
 
 def runs(good: Frames, segment: NDArray[np.int32], time: F64) -> NDArray[np.int64]:
@@ -171,7 +176,7 @@ def runs(good: Frames, segment: NDArray[np.int32], time: F64) -> NDArray[np.int6
     time: [T] s. Pictures that are repeated are not measured, and break nothing.
     """
     step = np.diff(time[good])
-    far = step > MISSING * np.median(step) if len(step) else np.zeros(0, bool)
+    far = step > max(MISSING * np.median(step), MISSING_S) if len(step) else np.zeros(0, bool)
     broken = far | (np.diff(segment[good]) != 0)
     return np.concatenate([[0], np.cumsum(broken)])
 
@@ -212,7 +217,7 @@ def resume(
 
 def at_rest(observed: F64, px_per_m: F64, sound: Frames) -> Frames:
     """Of the rows `sound` of landmarks [n, 478, 2] px those at rest, as `key_frames` chooses them."""
-    return sound[key_frames(observed[sound], px_per_m[sound])[0]]
+    return key_frames(observed[sound], px_per_m[sound]).of(sound).rest
 
 
 def make_track(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tracker.appearance import skin_triangles
 from tracker.camera import rigid_landmarks
 from tracker.flame_regions import regions_of
 from tracker.head import HeadModel, Joint, LandmarkEmbedding
@@ -25,6 +26,7 @@ LARGEST = 1e6  # number in the arrays: vertices are fewer, everything else is fa
 CLAY = (205, 186, 174)
 # Landmarks of the rigid upper face tell the head's pose: how many, and how far off any one line they lie (rms).
 LEAST_RIGID, LEAST_BREADTH_M = 6, 0.005
+LEAST_AREA_M2 = 1e-12  # of a face under a landmark, whose normal it tells
 
 Arrays = Mapping[str, NDArray[np.generic]]
 
@@ -68,8 +70,9 @@ def flame_head(
         digest.update(np.ascontiguousarray(checked[key]).tobytes())
     embedding = _embedding(points, skeleton, template, faces, digest.hexdigest())
     _check_rigid(embedding, template, faces)
+    _check_area(points, template, faces)
     flipped = template * np.array([-1, 1, 1])
-    return HeadModel(
+    head = HeadModel(
         name=name,
         sha256=digest.hexdigest(),
         template=template.astype(np.float32),
@@ -85,6 +88,9 @@ def flame_head(
         skeleton=skeleton,
         signed=True,
     )
+    if not len(skin_triangles(head)):
+        raise TrackError("no FLAME model: its masks leave no face of bare skin")
+    return head
 
 
 def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
@@ -92,15 +98,10 @@ def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
     missing = [key for key in ARRAYS if key not in arrays]
     if missing:
         raise TrackError(f"no FLAME model: {', '.join(missing)} is missing")
-    try:
-        checked = {key: np.atleast_1d(np.asarray(arrays[key], np.float64)) for key in ARRAYS}
-    except (TypeError, ValueError, OverflowError) as error:
-        raise TrackError(f"no FLAME model: arrays that are no numbers ({error})") from error
-    vertices, triangles = len(checked["v_template"]), len(checked["f"])
-    shapes = checked["shapedirs"].shape
-    modes = shapes[-1] if len(shapes) == 3 else 0
-    # The root's parent is 2^32 - 1.
-    checked["kintree_table"] = np.where(checked["kintree_table"] > 4, -1, checked["kintree_table"])
+    # Shapes first: what does not fit is not made larger by being made double.
+    shapes = {key: np.shape(arrays[key]) or (1,) for key in ARRAYS}
+    vertices, triangles = shapes["v_template"][0], shapes["f"][0]
+    modes = shapes["shapedirs"][-1] if len(shapes["shapedirs"]) == 3 else 0
     expected = {
         "v_template": (vertices, 3),
         "f": (triangles, 3),
@@ -110,10 +111,21 @@ def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
         "kintree_table": (2, len(PARENTS)),
         "weights": (vertices, len(PARENTS)),
     }
+    checked = {}
     for key, shape in expected.items():
-        if checked[key].shape != shape or not (np.abs(checked[key]) < LARGEST).all():  # NaN is not below it
+        if fits := shapes[key] == shape:
+            try:
+                checked[key] = np.asarray(arrays[key], np.float64)
+            except (TypeError, ValueError, OverflowError) as error:
+                raise TrackError(f"no FLAME model: {key} holds no numbers ({error})") from error
+            if key == "kintree_table":
+                checked[key] = np.where(
+                    checked[key] > len(PARENTS), -1, checked[key]
+                )  # the root's is 2^32 - 1
+            fits = bool((np.abs(checked[key]) < LARGEST).all())  # NaN is not below it
+        if not fits:
             raise TrackError(
-                f"no FLAME model: {key} is {checked[key].shape}, numbers below {LARGEST:.0e} of {shape} needed"
+                f"no FLAME model: {key} is {shapes[key]}, numbers below {LARGEST:.0e} of {shape} needed"
             )
     if not vertices or not triangles:
         raise TrackError(f"no FLAME model: it has {vertices} vertices and {triangles} faces")
@@ -142,6 +154,13 @@ def _check_points(points: SurfacePoints, faces: int) -> None:
         )
     if not np.allclose(points.barycentric.sum(1), 1, atol=1e-3):
         raise TrackError("the landmark embedding is damaged: barycentric coordinates do not sum to 1")
+
+
+def _check_area(points: SurfacePoints, template: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
+    corners = template[faces[points.triangles]]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    if not (area > LEAST_AREA_M2).all():
+        raise TrackError("no FLAME model: a face under a landmark has no area")
 
 
 def _check_rigid(

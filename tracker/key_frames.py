@@ -5,6 +5,8 @@ Spread in time alone they would show what is common again and again, and a turn 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
@@ -18,14 +20,40 @@ KEY_FRAMES = 48
 FEW, APART = 16, 3
 REST_SHARE = 0.5  # of the key frames: frames at rest, which tell the neutral face
 
+USUAL_M = 0.001  # by which a mouth at rest is wider or narrower than usual where it counts half
+ROUNDS = 8  # of telling how wide a mouth at rest usually is, of the frames in which it is so
+
 Frames = NDArray[np.int64]
 
 
-def key_frames(observed: F64, px_per_m: F64, count: int = KEY_FRAMES) -> tuple[Frames, Frames]:
-    """Frames at rest (mouth closed, little motion) spread over poses, and others, over poses and expressions.
+@dataclass(frozen=True)
+class KeyFrames:
+    """Rows of the frames at rest (mouth closed, little motion), spread over poses, and others, over expressions too.
 
-    `count` at most, fewer of a short clip, REST_SHARE of them at rest. observed: [n, 478, 2] px.
+    ease: [len(rest)] 0..1, how far the mouth is as wide as it usually is at rest: shut lips may smile, or be pursed.
     """
+
+    rest: Frames
+    other: Frames
+    ease: F64
+
+    @property
+    def rows(self) -> Frames:
+        """All of them, those at rest first."""
+        return np.concatenate([self.rest, self.other])
+
+    def of(self, rows: Frames) -> KeyFrames:
+        """They are rows of `rows`."""
+        return replace(self, rest=rows[self.rest], other=rows[self.other])
+
+    def among(self, rows: Frames) -> KeyFrames:
+        """Those that are among `rows`."""
+        rest, other = np.isin(self.rest, rows), np.isin(self.other, rows)
+        return KeyFrames(self.rest[rest], self.other[other], self.ease[rest])
+
+
+def key_frames(observed: F64, px_per_m: F64, count: int = KEY_FRAMES) -> KeyFrames:
+    """`count` frames at most, fewer of a short clip, REST_SHARE of them at rest. observed: [n, 478, 2] px."""
     n = len(observed)
     opening = np.linalg.norm(observed[:, 13] - observed[:, 14], axis=-1) / px_per_m
     lips = (observed[:, [61, 291, 13, 14]] - observed[:, [1]]) / px_per_m[:, None, None]
@@ -35,8 +63,26 @@ def key_frames(observed: F64, px_per_m: F64, count: int = KEY_FRAMES) -> tuple[F
     pose, features = _looks(observed, px_per_m)
     count = min(n, count, max(FEW, n // APART))
     usual = np.linalg.norm(pose[quiet] - np.median(pose[quiet], axis=0), axis=1).argmin()
-    rest = farthest(pose, quiet[[usual]], quiet, max(1, int(count * REST_SHARE)))
-    return np.sort(rest), np.sort(farthest(features, rest, np.arange(n), count)[len(rest) :])
+    rest = np.sort(farthest(pose, quiet[[usual]], quiet, max(1, int(count * REST_SHARE))))
+    other = np.sort(farthest(features, rest, np.arange(n), count)[len(rest) :])
+    width = np.linalg.norm(observed[:, 61] - observed[:, 291], axis=-1) / px_per_m
+    return KeyFrames(rest, other, _ease(width, pose, quiet)[rest])
+
+
+def _ease(width: F64, pose: F64, quiet: Frames) -> F64:
+    """[n] 0..1, how near mouths of `width` [n] m are to what is usual in the frames `quiet` under that pose [n, 2] m.
+
+    A parabola over the pose: turned aside, a mouth looks narrower.
+    """
+    apart = (pose - pose[quiet].mean(0)) / max(float(pose[quiet].std()), 1e-6)
+    terms = np.column_stack([np.ones(len(pose)), apart, apart**2, apart.prod(1)])
+    share = np.ones(len(quiet))
+    for _ in range(ROUNDS):
+        known = share[:, None] * terms[quiet]
+        usual = terms @ np.linalg.lstsq(known, share * width[quiet], rcond=None)[0]
+        away = (width - usual)[quiet]
+        share = 1 / np.hypot(1, away / max(1.4826 * float(np.median(np.abs(away))), 1e-6))
+    return np.asarray(1 / (1 + ((width - usual) / USUAL_M) ** 2))
 
 
 def _looks(observed: F64, px_per_m: F64) -> tuple[F64, F64]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
+CONVERGED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)  # px
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,9 @@ class Lens:
         if not self.distortion or not flat.size:
             return flat
         matrix, coefficients = self._opencv()
-        return cv2.undistortPoints(flat.reshape(-1, 1, 2), matrix, coefficients, P=matrix).reshape(flat.shape)
+        seen = flat.reshape(-1, 1, 2)
+        straight = cv2.undistortPoints(seen, matrix, coefficients, P=matrix, criteria=CONVERGED)
+        return straight.reshape(flat.shape)
 
     def picture(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A picture as a camera without distortion would see it."""

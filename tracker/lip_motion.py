@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from tracker.lip_lines import LOG, SAMPLES, STEP_MM
-from tracker.track import F64
+from tracker.track import F64, STEP_S
 from tracker.view import U8
 
 LONGEST_S = (
@@ -25,12 +25,10 @@ FIRST, LAST = (int(np.abs(SAMPLES - end).argmin()) for end in (-13.0, 13.0))
 REACH, FINER = 5, 2  # steps to both sides of what the edges tell, and trials in a step
 NEIGHBOUR = 0.5  # weight of the two lines beside a line in its motion
 STRETCH = 1.1  # of an edge's motion to that of what lies beside it
-STEP_S = (
-    0.04  # from frame to frame, of which the following are told: errors last for so long, whatever the rate
-)
 # Standard deviations of a width by its edges, as if each frame erred on its own (shut lips err by .1 mm, open ones by
 # .4 to .6, some eight frames alike), and of its change from one frame to the next: so much, and a share of it more. On
-# rendered films the change errs by half of that share, but real lips thicken and roll as they move.
+# rendered films the change errs by half of that share, but real lips thicken and roll as they move. All for frames
+# STEP_S apart: at other rates errors last as long.
 EDGE_MM, EDGE_SHARE = 0.1, 0.25
 MOVED_MM, MOVED_SHARE = 0.1, 0.2
 DOUBT_MM = 1.0  # by which edges and motion disagree where the motion counts half
@@ -45,9 +43,9 @@ def steadied(edges: F64, colours: U8, run: NDArray[np.int64], time: F64) -> F64:
     """
     widths = np.maximum(edges[..., 1] - edges[..., 0], 0.0)
     count = len(widths)
-    rate = float(np.median(np.diff(time))) / STEP_S if count > 1 else 1.0
-    links = [2**n for n in range(max(1, int(np.log2(LONGEST_S / STEP_S / rate)) + 1))]
-    weight = rate * (EDGE_MM + EDGE_SHARE * widths) ** -2.0
+    step = float(np.median(np.diff(time))) / STEP_S if count > 1 else 1.0
+    links = [2**n for n in range(max(1, int(np.log2(LONGEST_S / STEP_S / step)) + 1))]
+    weight = step * (EDGE_MM + EDGE_SHARE * widths) ** -2.0
     # The upper diagonals of the normal matrix, as solveh_banded has them, for each line.
     normal = np.zeros((max(links) + 1, *widths.shape))
     right = weight * widths
@@ -60,7 +58,7 @@ def steadied(edges: F64, colours: U8, run: NDArray[np.int64], time: F64) -> F64:
         told = widths[apart:] - widths[:-apart]
         fast = np.maximum(np.abs(told), np.abs(change))
         steps = (time[apart:] - time[:-apart])[:, None] / STEP_S
-        trust = rate / len(links) * linked[:, None] / (np.sqrt(steps) * MOVED_MM + MOVED_SHARE * fast) ** 2
+        trust = step / len(links) * linked[:, None] / (np.sqrt(steps) * MOVED_MM + MOVED_SHARE * fast) ** 2
         trust /= 1 + ((change - told) / DOUBT_MM) ** 2
         normal[-1, :-apart] += trust
         normal[-1, apart:] += trust

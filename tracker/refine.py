@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 # Frames that tell the albedo, half as many the identity: so many at least and at most, and no more than one of
 # KEYS_APART, since each costs as much as three fits.
 KEYS, KEYS_APART = (12, 48), 5
-STRETCH, OVERLAP = 120, 8  # frames solved at once, and how many more on both sides belong to the neighbours
+# Frames solved at once, and how many more on both sides belong to the neighbours: at least, and for so long a time.
+STRETCH, OVERLAP, OVERLAP_S = 120, 8, 0.32
 HALFWAY = 0.5  # to the bundle's poses: grey levels err as much, but slowly, and the tracks at random
 HELD_BYTES = 256 << 20  # of cut-out faces, about 100 s of them; a longer clip is read twice instead
 Frame = tuple[float, U8]
@@ -78,8 +79,8 @@ def refine_track(
     lines = LipLines.across(observed, energy.px_per_m, x)
     count = int(np.clip(len(sound) // KEYS_APART, *KEYS))
     usual = sound[np.linspace(0, len(sound) - 1, count).round().astype(int)]
-    rest, other = (sound[part] for part in key_frames(observed[sound], energy.px_per_m[sound], count // 2))
-    held, cuts, colours = _looked_at(subject, lines, camera, frames, good, {*usual, *rest, *other})
+    keys = key_frames(observed[sound], energy.px_per_m[sound], count // 2).of(sound)
+    held, cuts, colours = _looked_at(subject, lines, camera, frames, good, {*usual, *keys.rows})
     rows = np.array([row for row in held if row in usual], np.int64)
     if not len(rows):
         return Refined(track, unknown)
@@ -90,7 +91,7 @@ def refine_track(
     widths = _read_widths(lines, colours, good, segment, landmarks.time, sound)
     opened = lines.opened(observed, lines.widths(_fitted(subject, observed, x)) if widths is None else widths)
     subject = _with_landmarks(subject, opened, x, sound)
-    identity = fit_identity_to_skin(subject, held, (rest, other), x)
+    identity = fit_identity_to_skin(subject, held, keys, x)
     if widths is not None or (identity != track.identity).any():
         subject = subject.with_identity(identity)
         smoothness = smoothness_between(subject.energy, landmarks.time, good, segment)
@@ -99,7 +100,8 @@ def refine_track(
     levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
     refined = x.copy()
-    for start, part in _stretches(cuts, len(good)):
+    overlap = max(OVERLAP, round(OVERLAP_S / float(np.median(np.diff(time))))) if len(good) > 1 else OVERLAP
+    for start, part in _stretches(cuts, len(good), overlap):
         rows = np.array(list(part))
         smoothness = smoothness_between(
             subject.energy, landmarks.time, good[rows], segment, subject.smoothness
@@ -190,16 +192,18 @@ def _pictures(camera: Camera, frames: Iterable[Frame], good: Index) -> Iterator[
             yield row_of[frame], camera.lens.picture(rgb)
 
 
-def _stretches(cuts: Iterable[tuple[int, U8]], total: int) -> Iterator[tuple[int, dict[int, U8]]]:
-    """First row of each stretch, and the cut-outs of it and of the frames that it overlaps."""
+def _stretches(
+    cuts: Iterable[tuple[int, U8]], total: int, overlap: int
+) -> Iterator[tuple[int, dict[int, U8]]]:
+    """First row of each stretch, and the cut-outs of it and of the frames that it overlaps on both sides."""
     held: dict[int, U8] = {}
     start = 0
     for row, cut in cuts:
         held[row] = cut
-        if row + 1 >= min(start + STRETCH + OVERLAP, total):
+        if row + 1 >= min(start + STRETCH + overlap, total):
             yield start, held
             start += STRETCH
-            held = {row: cut for row, cut in held.items() if row >= start - OVERLAP}
+            held = {row: cut for row, cut in held.items() if row >= start - overlap}
     if any(row >= start for row in held):
         yield start, held
 

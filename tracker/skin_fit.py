@@ -155,7 +155,7 @@ class Subject:
 def fit_landmarks(subject: Subject, x: F64, smoothness: Smoothness) -> F64:
     """All frames from x [n, U] on, by landmarks alone, which have changed since, or the identity has."""
     shape = subject.energy.shape(subject.identity.astype(np.float64))
-    return solve_frames(subject.energy, shape, x, smoothness, steps=subject.photometry.refitting)[0]
+    return solve_frames(subject.energy, shape, x, smoothness, steps=subject.photometry.refitting)
 
 
 def learn_levels(subject: Subject, cuts: Sequence[U8], rows: Index, x: F64) -> list[Level]:
@@ -202,7 +202,7 @@ def _steadied(
     """
     shape = subject.energy.shape(subject.identity.astype(np.float64))
     alone = Smoothness.none(*x.shape)
-    x, _ = solve_frames(energy, shape, x, alone, steps=subject.photometry.steps)
+    x = solve_frames(energy, shape, x, alone, steps=subject.photometry.steps)
     drift = (x - anchor).mean(0)
     compliance = np.linalg.inv(energy.linearize(shape, x).hessian).mean(0)
     return replace(energy, pull=energy.pull - np.linalg.solve(compliance, drift)), x
@@ -219,7 +219,7 @@ def fit_stretch(
         energy = subject.photometric(cuts, rows, seen, level.blur_px)
         expected = _expected(energy.grey(x), level, basis, seen)
         energy = replace(energy, expected=expected, noise=level.noise, pull=level.pull)
-        x, _ = solve_frames(energy, shape, x, smoothness, steps=subject.photometry.steps)
+        x = solve_frames(energy, shape, x, smoothness, steps=subject.photometry.steps)
     return x, deviation(energy, start), deviation(energy, x)
 
 

@@ -9,7 +9,9 @@ import numpy as np
 
 from tracker.appearance import appearance, frame_light, shaded
 from tracker.energy import POSE, Energy, LandmarkModel, Quadratic, Weights, left_jacobian, rotation_matrix
+from tracker.fit import at_ease
 from tracker.jacobian import fill_rows
+from tracker.key_frames import KeyFrames
 from tracker.photometric import PhotometricEnergy
 from tracker.skin_fit import Subject, grey_noise
 from tracker.solver import solve_subject
@@ -118,18 +120,16 @@ class SubjectEnergy:
         return np.einsum("np,np...->p...", share, grey)
 
 
-def fit_identity_to_skin(subject: Subject, cuts: Mapping[int, U8], keys: tuple[Index, Index], x: F64) -> F64:
+def fit_identity_to_skin(subject: Subject, cuts: Mapping[int, U8], keys: KeyFrames, x: F64) -> F64:
     """Identity [Ki] from key frames at their landmark fit x [n, U]; the subject's where that brings the skin no nearer.
 
-    cuts: the faces of those that there are, by rows. keys: frames at rest, where expressions are held near zero as in
-    the landmark fit, and others.
+    cuts: the faces of those that there are, by rows.
     """
-    rest, other = (rows[np.isin(rows, list(cuts))] for rows in keys)
-    rows = np.concatenate([rest, other])
+    keys = keys.among(np.array(list(cuts)))
+    rows = keys.rows
     if not len(rows):
         return subject.identity.astype(np.float64)
-    landmarks = subject.energy.select(rows)
-    landmarks.strictness[: len(rest)] *= landmarks.weights.rest
+    landmarks = at_ease(subject.energy.select(rows), keys)
     identity, x = start = subject.identity.astype(np.float64), x[rows]
     seen, basis = subject.look(rows, x)
     moves = _movements(subject)

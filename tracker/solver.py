@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from tracker.energy import POSE, LandmarkModel, Quadratic, Weights
-from tracker.track import F64
+from tracker.track import F64, STEP_S
 
 ROUNDS = 4  # of fixing what passes a bound
 GIVE_UP = 1e6  # damping at which no step can help
-STEP_S = 0.04  # between two frames, of which precisions of bends are told
-LEAST_STEP = 0.05  # of that: nearer frames are taken to be so far apart
+LEAST_STEP = 0.05  # of STEP_S: nearer frames are taken to be so far apart
+PART, SHARED = 4000, 100  # frames of a long clip that are solved at once, and how many more on both sides
 CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
 
 
@@ -208,6 +208,12 @@ class Smoothness:
         bend *= np.sqrt(2 / (before + after))[:, None]
         return cls(triple[:, None] * precision, bend, tolerated)
 
+    def select(self, frames: slice) -> Smoothness:
+        """That of some frames in a row."""
+        start, stop, _ = frames.indices(len(self.bend) + 2)
+        bends = slice(start, max(stop - 2, start))
+        return replace(self, precision=self.precision[bends], bend=self.bend[bends])
+
     def value(self, x: F64) -> float:
         """Energy of x [n, P]."""
         square = self.precision * self._bends(x) ** 2
@@ -263,9 +269,37 @@ def solve_frames(
     steps: int = 10,
     tolerance: float = 1e-4,
     progress: Progress | None = None,
-) -> tuple[F64, float]:
-    """All frames [n, P] of the subject `shape` [L, 3] together, smooth in time; returns x and the energy."""
+) -> F64:
+    """All frames [n, P] of the subject `shape` [L, 3] together, smooth in time.
 
+    Of a long clip PART at once, and SHARED more on both sides, which belong to the neighbours: the equations of one
+    frame take .2 MB, of FLAME .5.
+    """
+    out, starts = x.copy(), range(0, len(x), PART)
+    for number, start in enumerate(starts):
+        first = max(start - SHARED, 0)
+        part = slice(first, start + PART + SHARED)
+
+        def so_far(done: int, total: int, number: int = number) -> None:
+            if progress:
+                progress(number * total + done, len(starts) * total)
+
+        found = _solve_part(
+            energy.select(part), shape, x[part], smoothness.select(part), steps, tolerance, so_far
+        )
+        out[start : start + PART] = found[start - first :][:PART]
+    return out
+
+
+def _solve_part(
+    energy: FrameEnergy,
+    shape: F64,
+    x: F64,
+    smoothness: Smoothness,
+    steps: int,
+    tolerance: float,
+    progress: Progress,
+) -> F64:
     def total(x: F64) -> float:
         parts = [energy.select(part).value(shape, x[part]).sum() for part in _chunks(len(x))]
         return float(sum(parts)) + smoothness.value(x)
@@ -283,16 +317,14 @@ def solve_frames(
             if trial_value < value or damping > GIVE_UP:
                 break
             damping *= 10
-        if progress:
-            progress(step + 1, steps)
+        progress(step + 1, steps)
         if trial_value >= value:
             break
         gain, value, x, damping = value - trial_value, trial_value, trial, max(damping / 5, 1e-6)
         if gain < tolerance * value:
             break
-    if progress:
-        progress(steps, steps)
-    return x, value
+    progress(steps, steps)
+    return x
 
 
 def _bounds(energy: FrameEnergy | SharedEnergy) -> Bounds:

@@ -12,6 +12,8 @@ from tracker.lens import Lens
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+STEP_S = 0.04  # from frame to frame, for which weights and errors are told; those of other rates follow
+
 
 class TrackError(ValueError):
     """The clip cannot be tracked; the message says what is missing, in one line."""

@@ -72,8 +72,14 @@ def test_wrong_files_are_refused_in_one_line(tmp_path: Path) -> None:
     assert "there is no file" in refused(path, tmp_path / "absent.npz")
     assert "is a .npz or a .pkl" in refused(path, tmp_path / "landmark_embedding.npy")
     torn = tmp_path / "torn.pkl"
-    torn.write_bytes(path.read_bytes()[:5000])
-    assert "not a readable pickle" in refused(torn, good)
+    for kept in (5000, -8):
+        torn.write_bytes(path.read_bytes()[:kept])
+        assert "not a readable pickle" in refused(torn, good)
+    np.savez_compressed(tmp_path / "damaged.npz", **FAKE.embedding(EMBEDDED))
+    content = bytearray((tmp_path / "damaged.npz").read_bytes())
+    content[80:90] = bytes(10)
+    (tmp_path / "damaged.npz").write_bytes(content)
+    assert "not a readable .npz" in refused(path, tmp_path / "damaged.npz")
     other = tmp_path / "other.pkl"
     other.write_bytes(pickle.dumps({"v_template": FAKE.content["v_template"]}))
     assert "is missing" in refused(other, good)

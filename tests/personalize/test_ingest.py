@@ -51,17 +51,30 @@ def test_a_repeated_picture_is_seen_and_a_small_motion_is_not_one() -> None:
     assert difference(grey, grey)[1] and not difference(moved, grey)[1]
 
 
-@pytest.mark.parametrize("every", [2, 5])
-def test_pictures_that_are_repeated_and_coded_anew_are_seen(every: int) -> None:
-    random = np.random.default_rng(0)
+@pytest.mark.parametrize(
+    ("rate", "new", "of"), [(30, 1, 2), (30, 4, 5), (60, 1, 2), (60, 1, 3), (60, 1, 4), (60, 1, 5)]
+)
+def test_pictures_that_are_repeated_and_coded_anew_are_seen(rate: int, new: int, of: int) -> None:
+    random, time = np.random.default_rng(0), np.arange(200) / rate
     change = random.uniform(0.6, 1.4, 200)
-    again = np.arange(200) % every == every - 1
+    again = np.arange(200) % of >= new
     change[again] = random.uniform(0.02, 0.08, again.sum())
     nothing = np.zeros(200, bool)
-    np.testing.assert_array_equal(repeated(change, nothing)[2:-2], again[2:-2])
+    np.testing.assert_array_equal(repeated(time, change, nothing)[5:-5], again[5:-5])
     still = random.uniform(0.02, 0.08, 200)
-    assert not repeated(still, nothing).any()
-    assert repeated(still, again).sum() == again.sum()
+    assert not repeated(time, still, nothing).any()
+    assert repeated(time, still, again).sum() == again.sum()
+
+
+def test_a_rest_of_a_fifth_of_a_second_is_no_repeated_picture() -> None:
+    change = np.where(np.arange(100) % 25 < 5, 0.05, 1.0)
+    assert not repeated(np.arange(100) / 25, change, np.zeros(100, bool)).any()
+
+
+def test_broken_time_stamps_take_no_more_memory_than_whole_ones() -> None:
+    time = np.arange(3000) / 90_000
+    assert find_shots(time, np.ones(3000)).max() == 0
+    assert not repeated(time, np.ones(3000), np.zeros(3000, bool)).any()
 
 
 def test_usable_time_bridges_repeated_frames_but_not_cuts() -> None:

@@ -35,6 +35,8 @@ def frames() -> Frames:
 def test_the_first_reason_counts(frames, track):
     assert frame_reasons(frames, track, DOUBTS, 0.5) == ["cut", "no_face", "blurred", "poor_fit", "ok", "ok"]
     assert frame_reasons(frames, track, DOUBTS, 0.0) == ["cut", "no_face", "ok", "ok", "ok", "ok"]
+    unknown = replace(track, confidence=np.full(6, np.nan, np.float32))
+    assert "ok" not in frame_reasons(frames, unknown, DOUBTS, 0.0)
 
 
 def test_quality_csv_carries_the_reasons(frames, track, tmp_path: Path):

@@ -47,7 +47,7 @@ class Clip:
         turns["root"] = self.rotation[frame] if root else np.zeros(3)
         return FAKE.vertices(self.identity, self.expression[frame], **turns)
 
-    def metrical(self, folder: Path) -> np.ndarray:
+    def metrical(self, folder: Path, **changed: np.ndarray) -> np.ndarray:
         """Writes checkpoint/*.frame; X_view = X R + t with x left, y up, z forward; returns OpenCV vertices."""
         (folder / "checkpoint").mkdir(parents=True)
         facing = Rotation.from_euler("y", np.pi)
@@ -60,7 +60,7 @@ class Clip:
                 "jaw": six(Rotation.from_rotvec(self.jaw[frame])),
                 "eyes": six(Rotation.from_rotvec(self.eyes[frame])).ravel(),
                 "eyelids": np.zeros(2),
-            }
+            } | changed
             place = {"R": six(Rotation.from_matrix(view.T)), "t": t, "fl": [FOCAL / 256], "pp": [0.02, -0.03]}
             write_frame(folder / f"checkpoint/{frame:05d}.frame", flame, place, CROP, frame)
             camera.append((self.posed(frame, root=False) @ view.T + t) * [-1, -1, 1])
@@ -181,6 +181,13 @@ def test_six_numbers_are_a_rotation() -> None:
     np.testing.assert_allclose(matrix_of_6d(3 * six(turn)), turn.as_matrix(), atol=1e-12)
 
 
+def test_six_zeros_are_none(head: HeadModel, tmp_path: Path) -> None:
+    assert np.isnan(matrix_of_6d(np.zeros((1, 6)))).all()
+    clip = Clip(count=2)
+    clip.metrical(tmp_path, jaw=np.zeros(6))
+    assert "flame.jaw holds what is no rotation" in refused(tmp_path, head)
+
+
 def refused(folder: Path, head: HeadModel) -> str:
     with pytest.raises(UserError) as caught:
         read_tracked(folder, head)
@@ -203,6 +210,9 @@ def test_wrong_folders_are_refused_in_one_line(head: HeadModel, tmp_path: Path) 
     assert "not a .frame file" in refused(tmp_path / "metrical", head)
     write_frame(path, {"exp": np.zeros(50)}, {"R": np.zeros(6)}, CROP, 1)
     assert "missing or no numbers" in refused(tmp_path / "metrical", head)
+    path.write_bytes(content)
+    path.rename(path.with_name("\N{SUPERSCRIPT ONE}.frame"))
+    assert "have gaps" in refused(tmp_path / "metrical", head)
     path = tmp_path / "vhap/tracked_flame_params_30.npz"
     data = dict(np.load(path))
     np.savez(path, **(data | {"expr": data["expr"][:, :50]}))

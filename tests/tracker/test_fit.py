@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tracker import solver
 from tracker.energy import LIP_PAIRS, Weights, landmark_model
 from tracker.fit import fit_track, make_track, resume, runs, with_lips_shut
 from tracker.head import load_head
@@ -411,14 +412,30 @@ def test_progress_ends_at_its_total(talker):
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
+def test_a_long_clip_is_solved_in_parts_to_the_same_end(talker, track, monkeypatch):
+    monkeypatch.setattr(solver, "PART", 40)
+    monkeypatch.setattr(solver, "SHARED", 12)
+    seen: list[tuple[int, int]] = []
+    every, one_shot = np.ones(len(track.time), bool), np.zeros(len(track.time), np.int32)
+    parts = fit_track(
+        talker.landmarks, CAMERA, HEAD, every, one_shot, lambda done, total: seen.append((done, total))
+    )
+    np.testing.assert_allclose(parts.rotation, track.rotation, atol=2e-4)
+    np.testing.assert_allclose(parts.lip_gap_mm, track.lip_gap_mm, atol=0.05)
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+    assert seen[-1][0] == seen[-1][1]
+
+
 def test_repeated_pictures_break_no_stretch_and_missing_ones_do():
     time, one_shot = np.arange(60) / 30, np.zeros(60, np.int32)
     fifths = np.flatnonzero(np.arange(60) % 5 < 4)
     assert runs(fifths, one_shot, time).max() == 0
     halves = np.flatnonzero(np.arange(60) % 2 == 0)
     assert runs(halves, one_shot, time).max() == 0
-    gap = np.setdiff1d(np.arange(60), [20, 21, 22])
-    assert runs(gap, one_shot, time).tolist() == [0] * 20 + [1] * 37
+    gap = np.setdiff1d(np.arange(60), [20, 21, 22, 23])
+    assert runs(gap, one_shot, time).tolist() == [0] * 20 + [1] * 36
+    slower = np.concatenate([time, time[-1] + np.arange(1, 20) / 10])
+    assert runs(np.arange(79), np.zeros(79, np.int32), slower).max() == 0
     assert runs(halves, (np.arange(60) >= 30).astype(np.int32), time).tolist() == [0] * 15 + [1] * 15
 
 

@@ -109,7 +109,8 @@ def test_the_51_points_are_named_symmetrically(fake: FakeFlame) -> None:
         ({"shapedirs": "cut"}, "holds 300 shapes"),
         ({"kintree_table": np.zeros((2, 5))}, "joints are not root"),
         ({"f": np.full((4, 3), 10_000)}, "faces name vertices"),
-        ({"v_template": np.array(["a"])}, "no numbers"),
+        ({"v_template": np.array(["a"])}, r"v_template is \(1,\)"),
+        ({"kintree_table": np.full((2, 5), "a")}, "kintree_table holds no numbers"),
         ({"v_template": np.array(0.1)}, r"v_template is \(1,\)"),
         ({"f": np.zeros((0, 3))}, "and 0 faces"),
     ],
@@ -152,6 +153,19 @@ def test_a_template_whose_landmarks_coincide_is_refused(fake: FakeFlame) -> None
     for template in (0 * content["v_template"], content["v_template"] * [0, 1, 1]):
         with pytest.raises(TrackError, match="in one place or on one line"):
             flame_head("flame", content | {"v_template": template}, surface(fake), {})
+
+
+def test_a_face_without_area_under_a_landmark_is_refused(fake: FakeFlame) -> None:
+    content, points = arrays(fake), surface(fake)
+    faces = content["f"].copy()
+    faces[points.triangles[0]] = faces[points.triangles[0], 0]
+    with pytest.raises(TrackError, match="no area"):
+        flame_head("flame", content | {"f": faces}, points, {})
+
+
+def test_masks_without_bare_skin_are_refused(fake: FakeFlame) -> None:
+    with pytest.raises(TrackError, match="bare skin"):
+        flame_head("flame", arrays(fake), surface(fake), {"face": np.arange(2, dtype=np.int32)})
 
 
 @pytest.mark.parametrize("landmarks", [EMBEDDED, IBUG_51])

@@ -4,10 +4,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.tracker.test_fit import DISTANCE, FOCAL, NAMES, Talker
-from tracker.key_frames import KEY_FRAMES, farthest, key_frames
+from tracker.key_frames import KEY_FRAMES, KeyFrames, farthest, key_frames
 
 
-def chosen(talker: Talker) -> tuple[np.ndarray, np.ndarray]:
+def chosen(talker: Talker) -> KeyFrames:
     scale = np.full(len(talker.gap), FOCAL / DISTANCE)
     return key_frames(talker.landmarks.points[..., :2].astype(np.float64), scale)
 
@@ -25,7 +25,8 @@ def test_key_frames_hold_every_pose_and_expression_however_rare():
     turn = np.zeros((1000, 2))
     turn[500:525, 0], turn[800:825, 1] = 25 * np.sin(np.linspace(0, np.pi, 25)), 15
     talker = Talker(1000, turn=Rotation.from_euler("yx", turn, degrees=True))
-    rest, other = chosen(talker)
+    keys = chosen(talker)
+    rest, other = keys.rest, keys.other
     assert len(np.unique(np.concatenate([rest, other]))) == KEY_FRAMES == len(rest) + len(other)
     assert talker.gap[rest].max() < np.quantile(talker.gap, 0.3)
     for frames in (rest, other):
@@ -40,12 +41,37 @@ def test_key_frames_hold_every_pose_and_expression_however_rare():
 def test_one_slip_of_the_landmarker_is_no_key_frame():
     talker = Talker(400, noise=0.001)
     talker.landmarks.points[200, 1] += 200  # the nose's tip
-    assert 200 not in np.concatenate(chosen(talker))
+    assert 200 not in chosen(talker).rows
 
 
 def test_frames_that_look_alike_are_taken_once():
     talker = Talker(3, noise=0)
     points = talker.landmarks.points[[0] * 20, :, :2].astype(np.float64)
-    rest, other = key_frames(points, np.full(20, FOCAL / DISTANCE))
-    assert len(rest) == 1
-    assert len(other) == 0
+    keys = key_frames(points, np.full(20, FOCAL / DISTANCE))
+    assert len(keys.rest) == len(keys.ease) == 1
+    assert len(keys.other) == 0
+
+
+def test_a_mouth_shut_in_a_smile_is_not_at_ease_and_one_that_is_turned_aside_is():
+    turn = np.radians(25) * np.sin(np.arange(600) / 40)
+    straight, smiling = (
+        Talker(600, turn=Rotation.from_rotvec(np.outer(turn, [0, 1, 0])), held=(slice(None), weights))
+        for weights in ({}, {"mouthSmileLeft": 0.6, "mouthSmileRight": 0.6})
+    )
+    smiles = np.arange(600) % 70 < 20
+    points = np.where(
+        smiles[:, None, None], smiling.landmarks.points[..., :2], straight.landmarks.points[..., :2]
+    )
+    keys = key_frames(points.astype(np.float64), np.full(600, FOCAL / DISTANCE))
+    smiled, aside = smiles[keys.rest], np.abs(turn[keys.rest]) > np.radians(15)
+    assert smiled.any() and (aside & ~smiled).any()
+    assert keys.ease[smiled].max() < 0.2
+    assert keys.ease[aside & ~smiled].min() > 0.6
+
+
+def test_key_frames_of_some_rows():
+    keys = KeyFrames(np.array([0, 2]), np.array([1, 3]), np.array([0.2, 1.0]))
+    rows = np.array([10, 20, 30, 40])
+    assert keys.of(rows).rows.tolist() == [10, 30, 20, 40]
+    some = keys.of(rows).among(np.array([30, 40, 99]))
+    assert (some.rest.tolist(), some.other.tolist(), some.ease.tolist()) == ([30], [40], [1.0])

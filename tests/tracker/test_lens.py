@@ -29,6 +29,12 @@ def test_points_come_back_to_where_a_pinhole_shows_them(distortion: tuple[float,
     np.testing.assert_allclose(back, straight.reshape(8, 5, 2), atol=0.02)
 
 
+def test_points_at_the_rim_of_a_wide_lens_come_back_as_well() -> None:
+    straight = np.array([[-250.0, 60.0], [900.0, 440.0]])
+    bent = seen(straight, (-0.25, 0.07))
+    np.testing.assert_allclose(Lens(FOCAL, PRINCIPAL, (-0.25, 0.07)).points(bent), straight, atol=0.01)
+
+
 def test_a_picture_moves_as_its_points_do() -> None:
     lens = Lens(FOCAL, PRINCIPAL, (-0.25,))
     for dot in [(120.0, 100.0), (500.0, 400.0)]:

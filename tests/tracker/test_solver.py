@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from tracker.energy import POSE, Quadratic
-from tracker.solver import STEP_S, Bounds, Smoothness, band_step, bounded_step, schur_step
+from tracker.solver import Bounds, Smoothness, band_step, bounded_step, schur_step
+from tracker.track import STEP_S
 
 FRAMES, WEIGHTS, IDENTITIES = 7, 3, 4
 UNKNOWNS = WEIGHTS + POSE
@@ -52,6 +53,14 @@ def test_smoothness_is_the_quadratic_form_and_its_gradient(rng, time):
     x = rng.normal(size=(FRAMES, UNKNOWNS))
     assert term.value(x) == pytest.approx(0.5 * x.ravel() @ dense @ x.ravel())
     np.testing.assert_allclose(term.gradient(x).ravel(), dense @ x.ravel(), atol=1e-12)
+
+
+def test_smoothness_of_some_frames_is_that_of_them_alone(rng):
+    run, precision = np.array([0, 0, 0, 0, 1, 1, 1]), rng.uniform(0.5, 2.0, UNKNOWNS)
+    whole, x = Smoothness.between(run, UNEVEN, precision, 2.0), rng.normal(size=(FRAMES, UNKNOWNS))
+    for part in (slice(0, 99), slice(2, 6), slice(5, 7), slice(6, 7)):
+        alone = Smoothness.between(run[part], UNEVEN[part], precision, 2.0)
+        np.testing.assert_allclose(whole.select(part).gradient(x[part]), alone.gradient(x[part]))
 
 
 def test_frames_an_even_step_apart_bend_by_their_second_difference():
