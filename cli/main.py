@@ -76,7 +76,6 @@ def main() -> None:
         typer.echo(f"personalize: {error}", err=True)
         code = INPUT_ERROR
     except (KeyboardInterrupt, typer.Abort):
-        typer.echo("personalize: interrupted; run the same command again to continue", err=True)
         code = INTERRUPTED
     except Exception as error:
         # Typer's own complaints about options carry an exit code; anything else is a bug of ours.
@@ -89,6 +88,8 @@ def main() -> None:
                 "personalize: this is a bug; please report it with the lines above and log.txt", err=True
             )
             code = BUG
+    if code == INTERRUPTED:  # typer's own exit code for it, too
+        typer.echo("personalize: interrupted; run the same command again to continue", err=True)
     sys.exit(code or 0)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from personalize.errors import UserError
 
 MAX_DURATION_S = 4 * 3600.0
+MATROSKA = "matroska,webm"
 MAX_SIDE_PX = 16_384
 STILL_FORMATS = ("_pipe", "image2", "gif")  # ends of the names of FFmpeg's readers of pictures
 
@@ -177,7 +178,10 @@ def _duration(path: Path, source: Source) -> float:
     if source.video.duration:
         duration = float(source.video.duration * source.video.time_base)
     else:
-        duration = float(source.container.duration or 0) / av.time_base
+        length = source.container.duration or 0
+        if source.container.format.name == MATROSKA:  # the time of its end, which need not begin at zero
+            length = max(length - max(source.container.start_time or 0, 0), 0)
+        duration = float(length) / av.time_base
     if duration > MAX_DURATION_S:
         raise UserError(
             f"{path}: {duration / 3600:.1f} h long; cut it to under {MAX_DURATION_S / 3600:.0f} h"

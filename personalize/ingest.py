@@ -40,6 +40,10 @@ MIN_RATE = 8.0  # different pictures a second; with fewer lips shut and open bet
 MIN_EYES_PX = 20.0  # between the eyes; below, lip motion is lost in the landmarks' jitter
 GOOD_EYES_PX = 45.0
 MIN_LIGHT, GOOD_LIGHT = 15.0, 35.0  # mean grey level of the face
+MAX_BURNT, GOOD_BURNT = (
+    0.5,
+    0.15,
+)  # share of its colour values that cannot be brighter: well lit faces have up to .1
 MIN_SHARPNESS = 0.2  # see people.sharpness: blocky or noisy video has 0.3 to 0.6
 MAX_TILT_DEG = 60.0  # of the line of the eyes: people tilt their heads by up to 45
 SILENCE = 1e-3  # peak of the sound, -60 dB
@@ -51,6 +55,7 @@ DESCRIPTIONS = {
     "other_person": "another person's face, or something covers it",
     "too_small": "the face is too small",
     "too_dark": "the face is too dark",
+    "too_bright": "the face is overexposed",
     "blurred": "the face is blurred",
     "corrupt": "damaged in the file",
     "duplicate": "the picture before is repeated",
@@ -110,18 +115,19 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     reason = np.full(total, REASONS.index("no_face"), np.uint8)
     for tracklet in others:
         reason[tracklet.frames] = REASONS.index("other_person")
-    measures = np.full((total, 7), np.nan, np.float32)  # box, eyes, light, sharpness
+    measures = np.full((total, 8), np.nan, np.float32)  # box, eyes, light, burnt, sharpness
     for tracklet in mine:
         rows = _filled(tracklet, time)
         known = tracklet.frames[0] + np.flatnonzero(~np.isnan(rows[:, 0]))
         reason[known] = 0
         measures[known] = rows[known - tracklet.frames[0]]
     scale = max(1.0, max(media.width, media.height) / SEARCH_SIDE)
-    box, eyes, light, sharp = measures[:, :4] * scale, measures[:, 4] * scale, measures[:, 5], measures[:, 6]
+    box, eyes, (light, burnt, sharp) = measures[:, :4] * scale, measures[:, 4] * scale, measures[:, 5:].T
     seen = reason == 0
     marks = {
         "blurred": seen & (sharp < MIN_SHARPNESS),
         "too_dark": seen & (light < MIN_LIGHT),
+        "too_bright": seen & (burnt > MAX_BURNT),
         "too_small": seen & (eyes < MIN_EYES_PX),
         "cut": seen & _cut(time, segment),
         "duplicate": again & seen,
@@ -130,7 +136,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     for name, marked in marks.items():  # the last that applies stays
         reason[marked] = REASONS.index(name)
     frames = Frames(time, reason == 0, reason, REASONS, segment, box.astype(np.float32))
-    return frames, _lost_in_file(media, time) + _warnings(frames, eyes, light)
+    return frames, _lost_in_file(media, time) + _warnings(frames, eyes, light, burnt)
 
 
 def _check_rate(media: MediaInfo, changed: NDArray[np.float64]) -> None:
@@ -192,13 +198,14 @@ def _follow_faces(media: MediaInfo, segment: NDArray[np.int32], progress: Progre
 
 
 def _filled(tracklet: Tracklet, time: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[n, 7] box, eyes, light and sharpness of each frame from a tracklet's first to its last.
+    """[n, 8] box, eyes, light, burnt and sharpness of each frame from a tracklet's first to its last.
 
     Frames that the detector missed are interpolated; NaN where it missed too many.
     """
     index = np.array(tracklet.frames)
     span = time[index[0] : index[-1] + 1]
-    known = np.column_stack([np.stack(tracklet.boxes), tracklet.eyes, tracklet.light, tracklet.sharpness])
+    seen = tracklet.eyes, tracklet.light, tracklet.burnt, tracklet.sharpness
+    known = np.column_stack([np.stack(tracklet.boxes), *seen])
     rows = np.column_stack([np.interp(span, time[index], column) for column in known.T])
     after = np.searchsorted(time[index], span)
     gap = time[index][after] - time[index][np.maximum(after - 1, 0)]
@@ -225,7 +232,9 @@ def _lost_in_file(media: MediaInfo, time: NDArray[np.float64]) -> list[str]:
     return texts
 
 
-def _warnings(frames: Frames, eyes: NDArray[np.float32], light: NDArray[np.float32]) -> list[str]:
+def _warnings(
+    frames: Frames, eyes: NDArray[np.float32], light: NDArray[np.float32], burnt: NDArray[np.float32]
+) -> list[str]:
     """What the person should know of a clip that is used all the same."""
     texts = []
     total = len(frames.time)
@@ -234,13 +243,20 @@ def _warnings(frames: Frames, eyes: NDArray[np.float32], light: NDArray[np.float
         if share > 0.05 or (share > 0 and name == "corrupt"):
             texts.append(f"{share:.1%} of {total} frames left out: {DESCRIPTIONS[name]}")
     if frames.usable.any():
-        size, level = float(np.median(eyes[frames.usable])), float(np.median(light[frames.usable]))
+        size, level, lost = (float(np.median(measure[frames.usable])) for measure in (eyes, light, burnt))
         if size < GOOD_EYES_PX:
             texts.append(
                 f"the face is small ({size:.0f} px between the eyes): lips will be measured coarsely"
             )
         if level < GOOD_LIGHT:
-            texts.append("the face is dark: more light would make the tracking steadier")
+            texts.append(
+                f"the face is dark ({level:.0f} of 255): lips may be measured a millimetre off; film with more light"
+            )
+        if lost > GOOD_BURNT:
+            texts.append(
+                f"the face is overexposed ({lost:.0%} of its colours cut off): lips may be measured a millimetre off; "
+                "film with less light or exposure"
+            )
     return texts
 
 

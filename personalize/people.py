@@ -16,6 +16,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 PATCH = 64  # px, side of the face for light and sharpness
+BRIGHTEST = 250  # a colour value that the camera may have cut off
 MIN_OVERLAP = 0.3  # intersection over union of a face's boxes from one picture to the next
 MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
 SAMPLE_S = 0.6  # time between two looks at the face's shape
@@ -32,8 +33,9 @@ SEEDS = 5  # largest tracklets tried as the main person
 class Tracklet:
     """One face followed through one shot. The lists hold an entry a frame, but for `shapes`.
 
-    frames: indices. times: s. boxes: [4] px. eyes: px between the eyes. light: mean grey level of the face.
-    sharpness: see `sharpness`. shapes: landmarks [478, 3] px, and portraits: PORTRAIT, of a frame every SAMPLE_S.
+    frames: indices. times: s. boxes: [4] px. eyes: px between the eyes. light: mean grey level of the face. burnt:
+    share of its colour values that cannot be brighter. sharpness: see `sharpness`. shapes: landmarks [478, 3] px, and
+    portraits: PORTRAIT, of a frame every SAMPLE_S.
     """
 
     segment: int
@@ -42,6 +44,7 @@ class Tracklet:
     boxes: list[F32] = field(default_factory=list)
     eyes: list[float] = field(default_factory=list)
     light: list[float] = field(default_factory=list)
+    burnt: list[float] = field(default_factory=list)
     sharpness: list[float] = field(default_factory=list)
     shapes: list[F32] = field(default_factory=list)
     portraits: list[U8] = field(default_factory=list)
@@ -78,8 +81,10 @@ class FaceFollower:
             tracklet.times.append(time)
             tracklet.boxes.append(face.box)
             tracklet.eyes.append(float(np.linalg.norm(face.keypoints[0] - face.keypoints[1])))
-            grey = _face_patch(rgb, face.box)
+            patch = _face_patch(rgb, face.box)
+            grey = cv2.cvtColor(patch, cv2.COLOR_RGB2GRAY)
             tracklet.light.append(float(grey.mean()))
+            tracklet.burnt.append(float((patch >= BRIGHTEST).mean()))
             tracklet.sharpness.append(sharpness(grey))
             self._sample(tracklet, time, face, rgb)
 
@@ -112,12 +117,11 @@ class FaceFollower:
 
 
 def _face_patch(rgb: U8, box: F32) -> U8:
-    """The face as [PATCH, PATCH] grey."""
+    """The face as [PATCH, PATCH, 3]."""
     left, top, right, bottom = np.round(box).astype(int)
     part = rgb[max(0, top) : max(0, bottom) + 1, max(0, left) : max(0, right) + 1]
     part = part if part.size else np.zeros((1, 1, 3), np.uint8)
-    small = cv2.resize(part, (PATCH, PATCH), interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    return np.asarray(cv2.resize(part, (PATCH, PATCH), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _portrait(rgb: U8, points: F32) -> U8:

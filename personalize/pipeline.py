@@ -13,7 +13,7 @@ from personalize.overlay import check_modes
 from personalize.reporter import Reporter
 from personalize.run import RunFolder
 from personalize.settings import Settings, check_focal
-from personalize.stage import Context, Stage, run_stages
+from personalize.stage import Context, Stage, check_names, run_stages
 from personalize.stages import (
     CameraStage,
     Evaluate,
@@ -63,6 +63,8 @@ def personalize_video(
     out: the run folder, by default the video's name + `.personalize` in the working folder.
     Raises UserError for whatever the user can mend.
     """
+    stages = STAGES if settings.tracked is None else TRACKED_STAGES
+    check_names(stages, first, until, force)
     media = probe(video)
     check_focal(settings.focal_px, (media.width, media.height))
     check_modes(settings.overlay)
@@ -84,7 +86,6 @@ def personalize_video(
         report.log_to(folder / "log.txt")
         run.begin(settings)
         try:
-            stages = STAGES if settings.tracked is None else TRACKED_STAGES
             run_stages(stages, Context(run, settings, report), first=first, until=until, force=force)
         except (TrackError, ModelError) as error:
             raise UserError(f"{video}: {error}") from error

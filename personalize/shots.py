@@ -14,6 +14,7 @@ REASONS = (
     "other_person",
     "too_small",
     "too_dark",
+    "too_bright",
     "blurred",
     "corrupt",
     "duplicate",

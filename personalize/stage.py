@@ -128,15 +128,21 @@ def run_stages(
 
     Raises UserError for a stage name that does not exist.
     """
+    check_names(stages, first, until, force)
     names = [stage.name for stage in stages]
-    for option, value in (("--from", first), ("--until", until), ("--force", force)):
-        if value is not None and value not in names:
-            raise UserError(f"{option} {value}: no such stage; choose one of {', '.join(names)}")
     from_index = names.index(first) if first else len(stages)
     for index, stage in enumerate(stages):
         run_stage(stage, context, force=index >= from_index or stage.name == force)
         if stage.name == until:
             break
+
+
+def check_names(stages: Sequence[Stage], first: str | None, until: str | None, force: str | None) -> None:
+    """Raise UserError for the name of a stage that does not exist."""
+    names = [stage.name for stage in stages]
+    for option, value in (("--from", first), ("--until", until), ("--force", force)):
+        if value is not None and value not in names:
+            raise UserError(f"{option} {value}: no such stage; choose one of {', '.join(names)}")
 
 
 def _open_partial(stage: Stage, key: str, root: Path, force: bool) -> Path:

@@ -135,6 +135,18 @@ def test_killed_in_every_stage_it_ends_in_the_same_result(talk: Path, finished: 
     assert content(out) == content(finished)
 
 
+def test_an_interrupted_run_says_how_it_goes_on(talk: Path) -> None:
+    out = talk.with_name("interrupted")
+    process = start(talk, out)
+    while process.poll() is None and not (out / ".landmarks.partial").exists():
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    _, complaints = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert b"interrupted; run the same command again to continue" in complaints
+    assert b"Traceback" not in complaints
+
+
 def test_a_second_run_makes_nothing(talk: Path, finished: Path) -> None:
     before = {
         path: path.stat().st_mtime_ns

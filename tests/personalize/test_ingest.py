@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ import pytest
 from personalize.container import probe
 from personalize.errors import UserError
 from personalize.ingest import MIN_USABLE_S, find_usable, ingest_video
-from personalize.people import Tracklet, main_person
+from personalize.people import FaceFollower, Tracklet, main_person
 from personalize.shots import REASONS, Frames, difference, find_shots, repeated, usable_seconds
 from personalize.split import make_split
 from tests.personalize.video_factory import RATE, clicks, moving, write_video
+from tracker.face_detector import Face
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 
 
@@ -165,7 +167,7 @@ def test_a_face_that_lies_on_its_side_is_refused(
 ) -> None:
     path = write_video(tmp_path / "clip.mkv", moving(20), [i / 25 for i in range(20)])
     face = tracklet(1, range(20))
-    face.eyes, face.light, face.sharpness = [60.0] * 20, [120.0] * 20, [0.5] * 20
+    face.eyes, face.light, face.burnt, face.sharpness = [60.0] * 20, [120.0] * 20, [0.0] * 20, [0.5] * 20
     angle = np.radians(tilt_deg)
     for shape in face.shapes:
         shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + 60 * np.array([np.cos(angle), np.sin(angle)])
@@ -175,6 +177,41 @@ def test_a_face_that_lies_on_its_side_is_refused(
             find_usable(probe(path))
     else:
         assert find_usable(probe(path))[0].usable.any()
+
+
+@pytest.mark.parametrize(
+    ("light", "burnt", "reason", "said"),
+    [
+        (120.0, 0.1, "ok", ""),
+        (190.0, 0.25, "ok", "overexposed (25% of its colours cut off)"),
+        (230.0, 0.7, "too_bright", "left out: the face is overexposed"),
+        (25.0, 0.0, "ok", "dark (25 of 255)"),
+        (8.0, 0.0, "too_dark", "left out: the face is too dark"),
+    ],
+)
+def test_too_much_light_is_told_as_too_little_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, light: float, burnt: float, reason: str, said: str
+) -> None:
+    path = write_video(tmp_path / "clip.mkv", moving(20), [i / 25 for i in range(20)])
+    face = tracklet(1, range(20))
+    face.eyes, face.light, face.burnt, face.sharpness = [60.0] * 20, [light] * 20, [burnt] * 20, [0.5] * 20
+    for shape in face.shapes:
+        shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [60, 0]
+    monkeypatch.setattr("personalize.ingest._follow_faces", lambda *_: [face])
+    frames, warnings = find_usable(probe(path))
+    assert {frames.reasons[index] for index in frames.reason[1:]} == {reason}
+    assert (said in " ".join(warnings)) if said else not any("face is" in text for text in warnings)
+
+
+def test_how_much_of_a_face_is_cut_off_is_measured() -> None:
+    picture = np.full((480, 640, 3), 90, np.uint8)
+    picture[100:200] = (255, 252, 120)
+    face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
+    landmarker = Mock(detect=lambda rgb: [face], landmarks=lambda *_: (np.zeros((478, 3)), 0.0, None))
+    follower = FaceFollower(landmarker)
+    follower.add(0, 0.0, 0, picture)
+    assert follower.tracklets[0].burnt == pytest.approx([1 / 3], abs=0.01)
+    assert follower.tracklets[0].light == pytest.approx([0.5 * (90 + 237.6)], abs=2)
 
 
 @pytest.mark.parametrize(
@@ -194,6 +231,12 @@ def test_too_few_pictures_a_second_are_refused_before_faces_are_looked_for(
     else:
         find_usable(probe(path))
     assert bool(looked) != bool(said)
+
+
+def test_a_matroska_file_that_begins_late_breaks_not_off(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "late.mkv", moving(50), [5 * 3600 + i / 25 for i in range(50)])
+    assert probe(path).duration_s == pytest.approx(2.0, abs=0.1)
+    assert not any("breaks off" in text for text in find_usable(probe(path))[1])
 
 
 def test_what_the_file_lost_is_said(tmp_path: Path) -> None:
