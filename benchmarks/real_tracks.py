@@ -32,7 +32,7 @@ from benchmarks.track_errors import CLOSED_MM, recovery_frames
 from personalize import run as files
 from personalize.quality import read_reasons
 from personalize.run import RunFolder
-from tracker.head import load_head
+from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.track import F64, Landmarks, Track
 
@@ -89,9 +89,8 @@ def about_lines(places: F64) -> float:
     return float(np.sqrt((rest.reshape(places.shape) ** 2).sum(-1).mean()))
 
 
-def shaking(track: Track, frames: slice) -> float:
+def shaking(track: Track, head: HeadModel, frames: slice) -> float:
     """Rms of the face's vertices in the head frame about straight lines over some frames' time, mm."""
-    head = load_head()
     vertices = head.vertices(track.identity, track.expression[frames], jaw=track.jaw[frames])
     return 1e3 * about_lines(vertices[:, head.regions["face"]].astype(np.float64))
 
@@ -151,7 +150,9 @@ def report(folder: Path) -> list[str]:
     landmarks = files.read_landmarks(folder / "landmarks/landmarks.npz")
     segment = files.read_frames(folder / "ingest/frames.npz").segment
     fits = {name: files.read_track(folder / name / "track.npz") for name in ("track", "refine")}
-    raw, refined = raw_openings(landmarks), fits["refine"]
+    raw, refined, head = raw_openings(landmarks), fits["refine"], load_head()
+    if refined.head != f"{head.name}@{head.sha256}":
+        raise SystemExit(f"{folder}: tracked with {refined.head}; only runs of the embedded head are judged")
     used = read_reasons(folder / "refine/quality.csv") == "ok"
     seen = used & np.isfinite(raw)
     gap = refined.lip_gap_mm.astype(np.float64)
@@ -167,14 +168,14 @@ def report(folder: Path) -> list[str]:
     ]
     points = landmarks.points[..., :2] / eye_distance(landmarks)[:, None, None]
     if (calm := stillest(points, refined.time, seen, segment)).stop:
-        lines.append("  still {:.3f}, {:.3f}".format(*(shaking(fit, calm) for fit in fits.values())))
+        lines.append("  still {:.3f}, {:.3f}".format(*(shaking(fit, head, calm) for fit in fits.values())))
     error = np.where(refined.valid, refined.reprojection_px, np.inf).astype(np.float64)
     if np.isfinite(back := recovery_frames(error, ~used)):
         lines.append(f"  back {back:.0f}")
     if cuts := np.count_nonzero(np.diff(segment)):
         residual = refined.reprojection_px.astype(np.float64)
         lines.append("  cuts {}: {:.2f}, {:.2f}".format(cuts, *after_cuts(residual, used, segment)))
-    lines += [f"  {line}" for line in mesh_on_picture(shifts(run, load_head(), used), refined.time, used)]
+    lines += [f"  {line}" for line in mesh_on_picture(shifts(run, head, used), refined.time, used)]
     words = run.video.with_suffix(".words.json")
     if words.is_file() and (found := closures(raw, gap, refined.time, seen, plosive_starts(words))):
         near, apart = np.transpose(found)

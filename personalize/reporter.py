@@ -69,6 +69,9 @@ class Reporter:
             self._bar.start()
         try:
             yield
+        except BaseException as error:
+            self._write_log(f"{name} stopped: {str(error) or type(error).__name__}")
+            raise
         finally:
             if self._bar is not None:
                 self._bar.stop()

@@ -74,7 +74,9 @@ def test_an_encoder_a_device_a_focal_length_or_a_mode_that_is_not_there_gets_one
     assert_refused(personalize("run", video, "--distortion", "-0.2,much", cwd=tmp_path), "-0.2,much")
     assert_refused(personalize("run", video, "--focal", "inf", cwd=tmp_path), "--focal inf", "96x64 px")
     assert_refused(personalize("run", video, "--overlay", "shaded,wire", cwd=tmp_path), "wire:", "wireframe")
-    assert_refused(personalize("run", video, "--until", "lunch", cwd=tmp_path), "--until lunch", "registration")
+    assert_refused(
+        personalize("run", video, "--until", "lunch", cwd=tmp_path), "--until lunch", "registration"
+    )
     subject = ("--subject", BASE_CHECKPOINT)
     assert_refused(personalize("animate", speech, *subject, "--encoder", "nowhere", cwd=tmp_path), "nowhere")
     assert sorted(tmp_path.iterdir()) == [speech, video]

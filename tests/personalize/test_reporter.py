@@ -1,10 +1,12 @@
 """Time left in plain lines: of a stage from its start, of what it continues, and of a second count in it."""
 
 import io
+from pathlib import Path
 
 import pytest
 
 from personalize import reporter
+from personalize.errors import UserError
 from personalize.reporter import Reporter
 
 
@@ -48,3 +50,12 @@ def test_what_was_done_before_took_no_time(clock: Clock) -> None:
 def test_another_total_begins_another_count(clock: Clock) -> None:
     steps = [(1, 1, 100), (500, 100, 100), (10, 1, 11), (20, 3, 11)]
     assert lines(clock, steps) == ["about 80 s left"]
+
+
+def test_the_log_says_why_a_stage_stopped(tmp_path: Path) -> None:
+    reporter = Reporter(io.StringIO())
+    reporter.log_to(tmp_path / "log.txt")
+    for error, said in ((UserError("too dark"), "too dark"), (KeyboardInterrupt(), "KeyboardInterrupt")):
+        with pytest.raises(type(error)), reporter.stage("ingest"):
+            raise error
+        assert (tmp_path / "log.txt").read_text().splitlines()[-1].endswith(f"ingest stopped: {said}")
