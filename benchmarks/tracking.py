@@ -158,6 +158,13 @@ def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str,
             yield "shared", path.stem, watched(path.with_suffix(".mp4"), head), GroundTruth.load(path)
 
 
+def compile_ahead(head: HeadModel) -> None:
+    """Have everything compiled that is compiled when it is first called, so that no clip's time holds it."""
+    shortest = min(SCENES, key=lambda scene: scene.seconds)
+    for _ in stages(watched(film(shortest, head)[0], head), head):
+        pass
+
+
 def scan_heads() -> list[Path]:
     """The truths of the shared data."""
     shared = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[2] / "shared"))
@@ -207,6 +214,8 @@ def main() -> None:
     if not named and not scan_heads():
         print("without rendered scan heads: $PERSONALIZE_SHARED does not name a folder with data/gt")
     head, rows = load_head(), list[Row]()
+    if videos or not named or not all(name.startswith("person") for name in chosen):
+        compile_ahead(head)
     if chosen or not named:
         print(
             f"{'clip':16s} {'stage':10s}", *(f"{name:>{max(6, len(name) + 1)}}" for name in COLUMNS), sep=""
