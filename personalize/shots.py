@@ -27,6 +27,8 @@ CUT_LEVEL, CUT_RATIO, CUT_WINDOW_S = 1.5, 1.9, 0.28
 SAME_LEVEL = 1.0  # grey levels: no pixel of the thumbnail changes by more in a repeated picture
 # One that was coded anew changes by less than this (mean), and by so small a share of what pictures around it do.
 CODED_LEVEL, CODED_SHARE = 0.12, 0.15
+# In a clip of which so much is told to be repeated, by less than this: of its new pictures the share is 2 and more.
+REPEATING, REPEATING_LEVEL, REPEATING_SHARE = 0.05, 0.25, 0.45
 REPEATED_S = (
     0.085  # within which the same picture may be shown again and again, and there is a new one on either side
 )
@@ -73,7 +75,11 @@ def repeated(time: F64, change: F64, same: Bool) -> Bool:
         np.max([padded[reach + way * step :][: len(change)] for step in range(1, reach + 1)], axis=0)
         for way in (-1, 1)
     )
-    return same | ((change < CODED_LEVEL) & (change < CODED_SHARE * np.minimum(before, after)))
+    share = change / np.maximum(np.minimum(before, after), 1e-9)
+    coded = (change < CODED_LEVEL) & (share < CODED_SHARE)
+    if coded.mean() > REPEATING:
+        coded = (change < REPEATING_LEVEL) & (share < REPEATING_SHARE)
+    return same | coded
 
 
 def find_shots(time: F64, change: F64) -> NDArray[np.int32]:

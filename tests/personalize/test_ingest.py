@@ -68,6 +68,17 @@ def test_pictures_that_are_repeated_and_coded_anew_are_seen(rate: int, new: int,
     assert repeated(time, still, again).sum() == again.sum()
 
 
+def test_in_a_clip_that_repeats_pictures_more_of_the_small_changes_are_repeats() -> None:
+    random, time = np.random.default_rng(0), np.arange(600) / 60
+    again, change, nothing = np.arange(600) % 2 == 1, random.uniform(0.3, 0.7, 600), np.zeros(600, bool)
+    slow = change.copy()
+    change[again] = random.uniform(0.03, 0.13, again.sum())
+    assert repeated(time, change, nothing)[again].mean() > 0.98
+    assert not repeated(time, change, nothing)[~again].any()
+    slow[::40] = 0.11  # where nothing else is repeated, a moment of rest is none
+    assert not repeated(time, slow, nothing).any()
+
+
 def test_a_rest_of_a_fifth_of_a_second_is_no_repeated_picture() -> None:
     change = np.where(np.arange(100) % 25 < 5, 0.05, 1.0)
     assert not repeated(np.arange(100) / 25, change, np.zeros(100, bool)).any()
