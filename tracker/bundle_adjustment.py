@@ -8,6 +8,8 @@ and gives them at integers.
 
 from __future__ import annotations
 
+import signal
+import threading
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +32,9 @@ LONGEST_STEP = 0.5  # of log(focal)
 SEED = 0
 
 pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # a rejected step is no news to a user
+if threading.current_thread() is threading.main_thread():
+    # What was there before it was imported: pycolmap's own handler takes an ended process for a crash, and says so.
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 
 @dataclass(frozen=True)

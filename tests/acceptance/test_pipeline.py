@@ -135,16 +135,23 @@ def test_killed_in_every_stage_it_ends_in_the_same_result(talk: Path, finished: 
     assert content(out) == content(finished)
 
 
-def test_an_interrupted_run_says_how_it_goes_on(talk: Path) -> None:
-    out = talk.with_name("interrupted")
+@pytest.mark.parametrize(
+    ("how", "code", "said"),
+    [
+        (signal.SIGINT, 130, b"interrupted; run the same command again to continue"),
+        (signal.SIGTERM, -signal.SIGTERM, b""),
+    ],
+)
+def test_an_ended_run_is_no_crash(talk: Path, how: signal.Signals, code: int, said: bytes) -> None:
+    out = talk.with_name(how.name)
     process = start(talk, out)
     while process.poll() is None and not (out / ".landmarks.partial").exists():
         time.sleep(0.005)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(how)
     _, complaints = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert b"interrupted; run the same command again to continue" in complaints
-    assert b"Traceback" not in complaints
+    assert process.returncode == code
+    assert said in complaints
+    assert b"Traceback" not in complaints and b"Aborted" not in complaints
 
 
 def test_a_second_run_makes_nothing(talk: Path, finished: Path) -> None:
