@@ -40,10 +40,8 @@ MIN_RATE = 8.0  # different pictures a second; with fewer lips shut and open bet
 MIN_EYES_PX = 20.0  # between the eyes; below, lip motion is lost in the landmarks' jitter
 GOOD_EYES_PX = 45.0
 MIN_LIGHT, GOOD_LIGHT = 15.0, 35.0  # mean grey level of the face
-MAX_BURNT, GOOD_BURNT = (
-    0.5,
-    0.15,
-)  # share of its colour values that cannot be brighter: well lit faces have up to .1
+# Share of the face's colour values that cannot be brighter: well lit faces have up to .1.
+MAX_BURNT, GOOD_BURNT = 0.5, 0.2
 MIN_SHARPNESS = 0.2  # see people.sharpness: blocky or noisy video has 0.3 to 0.6
 MAX_TILT_DEG = 60.0  # of the line of the eyes: people tilt their heads by up to 45
 SILENCE = 1e-3  # peak of the sound, -60 dB

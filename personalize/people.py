@@ -16,6 +16,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 PATCH = 64  # px, side of the face for light and sharpness
+MIDDLE = np.s_[PATCH // 4 :, PATCH // 5 : -PATCH // 5]  # of it: no background, which may be a white wall
 BRIGHTEST = 250  # a colour value that the camera may have cut off
 MIN_OVERLAP = 0.3  # intersection over union of a face's boxes from one picture to the next
 MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
@@ -84,7 +85,7 @@ class FaceFollower:
             patch = _face_patch(rgb, face.box)
             grey = cv2.cvtColor(patch, cv2.COLOR_RGB2GRAY)
             tracklet.light.append(float(grey.mean()))
-            tracklet.burnt.append(float((patch >= BRIGHTEST).mean()))
+            tracklet.burnt.append(float((patch[MIDDLE] >= BRIGHTEST).mean()))
             tracklet.sharpness.append(sharpness(grey))
             self._sample(tracklet, time, face, rgb)
 
