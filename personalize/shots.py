@@ -29,9 +29,7 @@ SAME_LEVEL = 1.0  # grey levels: no pixel of the thumbnail changes by more in a 
 CODED_LEVEL, CODED_SHARE = 0.12, 0.15
 # In a clip of which so much is told to be repeated, by less than this: of its new pictures the share is 2 and more.
 REPEATING, REPEATING_LEVEL, REPEATING_SHARE = 0.05, 0.25, 0.45
-REPEATED_S = (
-    0.085  # within which the same picture may be shown again and again, and there is a new one on either side
-)
+REPEATED_S = 0.085  # within which the same picture may be shown again and again; then there is a new one
 MOST_WINDOW = 100  # pictures: broken time stamps may lie any number to the second
 
 U8 = NDArray[np.uint8]

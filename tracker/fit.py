@@ -164,7 +164,7 @@ def fit_identity(energy: Energy, start: F64, keys: KeyFrames) -> F64:
 
 
 def at_ease(energy: Energy, keys: KeyFrames) -> Energy:
-    """The energy of the key frames, whose expressions are held near zero where they are at rest."""
+    """The energy of the key frames, whose expressions are held near zero where the face is at rest, and at ease."""
     strictness = energy.strictness.copy()
     strictness[: len(keys.rest)] *= energy.weights.rest**keys.ease
     return replace(energy, strictness=strictness)

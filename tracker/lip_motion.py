@@ -16,9 +16,7 @@ from tracker.lip_lines import LOG, SAMPLES, STEP_MM
 from tracker.track import F64, STEP_S
 from tracker.view import U8
 
-LONGEST_S = (
-    0.35  # between two frames in which motion is looked for: the farther apart, the less errors add up
-)
+LONGEST_S = 0.35  # between frames in which motion is looked for: the farther apart, the less errors add up
 BESIDE = 25  # samples beside an edge, from the first step on: 10 mm of lip and skin
 # Samples of a line that are looked at: 13 mm to both sides of its middle. Nose and chin move on their own.
 FIRST, LAST = (int(np.abs(SAMPLES - end).argmin()) for end in (-13.0, 13.0))
