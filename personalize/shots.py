@@ -73,10 +73,10 @@ def repeated(time: F64, change: F64, same: Bool) -> Bool:
         np.max([padded[reach + way * step :][: len(change)] for step in range(1, reach + 1)], axis=0)
         for way in (-1, 1)
     )
-    share = change / np.maximum(np.minimum(before, after), 1e-9)
-    coded = (change < CODED_LEVEL) & (share < CODED_SHARE)
+    around = np.minimum(before, after)
+    coded = (change < CODED_LEVEL) & (change < CODED_SHARE * around)
     if coded.mean() > REPEATING:
-        coded = (change < REPEATING_LEVEL) & (share < REPEATING_SHARE)
+        coded = (change < REPEATING_LEVEL) & (change < REPEATING_SHARE * around)
     return same | coded
 
 

@@ -79,6 +79,13 @@ def test_in_a_clip_that_repeats_pictures_more_of_the_small_changes_are_repeats()
     assert not repeated(time, slow, nothing).any()
 
 
+def test_the_first_picture_and_a_still_one_repeat_nothing() -> None:
+    change, nothing = np.ones(50), np.zeros(50, bool)
+    change[0] = 0
+    change[20:30] = 0
+    assert not repeated(np.arange(50) / 25, change, nothing).any()
+
+
 def test_a_rest_of_a_fifth_of_a_second_is_no_repeated_picture() -> None:
     change = np.where(np.arange(100) % 25 < 5, 0.05, 1.0)
     assert not repeated(np.arange(100) / 25, change, np.zeros(100, bool)).any()
