@@ -49,7 +49,13 @@ def talk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def start(video: Path, out: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "cli.main", str(video), "--out", str(out), "--iterations", ITERATIONS]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        # What a shell starts in the background, these tests perhaps, ignores the interrupt, and so would its children.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
 
 
 @pytest.fixture(scope="session")
