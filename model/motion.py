@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import lzma
 import math
 import os
+import tokenize
 import zipfile
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +23,11 @@ BASIS_ERROR_M = 1e-5
 # What a motion file may hold once unpacked: an hour at 5 000 vertices as displacements is 6.5 GB, in basis
 # form 30 MB.
 LARGEST_MOTION_BYTES = 4 << 30
+# What a damaged archive of arrays, or the header of one of them, makes its readers raise.
+DAMAGED = (
+    OSError, ValueError, EOFError, MemoryError, OverflowError, RuntimeError, SyntaxError, tokenize.TokenError,
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError,
+)  # fmt: skip
 
 
 class MotionError(ValueError):
@@ -169,7 +177,7 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             return {name: archive_arrays[name] for name in archive_arrays.files}
     except MotionError:
         raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+    except DAMAGED as error:
         reason = " ".join(str(error).split())
         raise MotionError(f"{path} is not a readable motion file (.npz): {reason}") from error
 

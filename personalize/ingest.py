@@ -176,12 +176,8 @@ def _look_for_cuts(
         if progress is not None:
             progress(min(len(rows), expected), 2 * expected)
     times, changes, same, damaged = zip(*rows)
-    return (
-        np.array(times),
-        np.array(changes),
-        repeated(np.array(times), np.array(changes), np.array(same)),
-        np.array(damaged),
-    )
+    at, differences = np.array(times), np.array(changes)
+    return at, differences, repeated(at, differences, np.array(same)), np.array(damaged)
 
 
 def _follow_faces(media: MediaInfo, segment: NDArray[np.int32], progress: Progress) -> list[Tracklet]:

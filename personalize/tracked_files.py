@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from model.motion import DAMAGED
 from personalize.errors import UserError
 from personalize.restricted_pickle import LARGEST_PICKLE_BYTES, build_pickle
-from personalize.user_arrays import DAMAGED, read_user_npz
+from personalize.user_arrays import read_user_npz
 from tracker.head import HeadModel
 from tracker.track import F64
 

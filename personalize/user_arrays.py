@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import lzma
-import tokenize
 import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from model.motion import DAMAGED
 from personalize.errors import UserError
 
 LARGEST_ARRAYS_BYTES = 2 << 30
-# What a damaged archive, or the header of an array in it, makes its readers raise.
-DAMAGED = (
-    OSError, ValueError, EOFError, MemoryError, OverflowError, RuntimeError, SyntaxError, tokenize.TokenError,
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError,
-)  # fmt: skip
 
 
 def read_user_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[np.generic]]:

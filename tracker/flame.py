@@ -119,9 +119,8 @@ def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
             except (TypeError, ValueError, OverflowError) as error:
                 raise TrackError(f"no FLAME model: {key} holds no numbers ({error})") from error
             if key == "kintree_table":
-                checked[key] = np.where(
-                    checked[key] > len(PARENTS), -1, checked[key]
-                )  # the root's is 2^32 - 1
+                # The root's parent is 2^32 - 1.
+                checked[key] = np.where(checked[key] >= len(PARENTS), -1, checked[key])
             fits = bool((np.abs(checked[key]) < LARGEST).all())  # NaN is not below it
         if not fits:
             raise TrackError(

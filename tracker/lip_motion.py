@@ -16,7 +16,8 @@ from tracker.lip_lines import LOG, SAMPLES, STEP_MM
 from tracker.track import F64, STEP_S
 from tracker.view import U8
 
-LONGEST_S = 0.35  # between frames in which motion is looked for: the farther apart, the less errors add up
+# Time between frames in which motion is looked for (the farther apart, the less errors add up), and frames at most.
+LONGEST_S, MOST_APART = 0.35, 64
 BESIDE = 25  # samples beside an edge, from the first step on: 10 mm of lip and skin
 # Samples of a line that are looked at: 13 mm to both sides of its middle. Nose and chin move on their own.
 FIRST, LAST = (int(np.abs(SAMPLES - end).argmin()) for end in (-13.0, 13.0))
@@ -42,7 +43,8 @@ def steadied(edges: F64, colours: U8, run: NDArray[np.int64], time: F64) -> F64:
     widths = np.maximum(edges[..., 1] - edges[..., 0], 0.0)
     count = len(widths)
     step = float(np.median(np.diff(time))) / STEP_S if count > 1 else 1.0
-    links = [2**n for n in range(max(1, int(np.log2(LONGEST_S / STEP_S / step)) + 1))]
+    farthest = np.clip(LONGEST_S / STEP_S / step, 1, MOST_APART)
+    links = [2**n for n in range(int(np.log2(farthest)) + 1)]
     weight = step * (EDGE_MM + EDGE_SHARE * widths) ** -2.0
     # The upper diagonals of the normal matrix, as solveh_banded has them, for each line.
     normal = np.zeros((max(links) + 1, *widths.shape))

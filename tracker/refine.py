@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 # Frames that tell the albedo, half as many the identity: so many at least and at most, and no more than one of
 # KEYS_APART, since each costs as much as three fits.
 KEYS, KEYS_APART = (12, 48), 5
-# Frames solved at once, and how many more on both sides belong to the neighbours: at least, and for so long a time.
+# Frames solved at once, and how many more on both sides belong to the neighbours: for so long a time, and so many
+# at least, no more than are solved.
 STRETCH, OVERLAP, OVERLAP_S = 120, 8, 0.32
 HALFWAY = 0.5  # to the bundle's poses: grey levels err as much, but slowly, and the tracks at random
 HELD_BYTES = 256 << 20  # of cut-out faces, about 100 s of them; a longer clip is read twice instead
@@ -100,8 +101,7 @@ def refine_track(
     levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
     refined = x.copy()
-    overlap = max(OVERLAP, round(OVERLAP_S / float(np.median(np.diff(time))))) if len(good) > 1 else OVERLAP
-    for start, part in _stretches(cuts, len(good), overlap):
+    for start, part in _stretches(cuts, len(good), _overlap(time)):
         rows = np.array(list(part))
         smoothness = smoothness_between(
             subject.energy, landmarks.time, good[rows], segment, subject.smoothness
@@ -190,6 +190,12 @@ def _pictures(camera: Camera, frames: Iterable[Frame], good: Index) -> Iterator[
     for frame, (_, rgb) in enumerate(frames):
         if frame in row_of:
             yield row_of[frame], camera.lens.picture(rgb)
+
+
+def _overlap(time: F64) -> int:
+    """How many frames on both sides a stretch of frames at `time` [n] s shares with its neighbours."""
+    step = float(np.median(np.diff(time))) if len(time) > 1 else OVERLAP_S
+    return int(np.clip(round(OVERLAP_S / step), OVERLAP, STRETCH))
 
 
 def _stretches(

@@ -83,7 +83,9 @@ def _between(stretches: Corrections, time: F64) -> F64:
     known = np.concatenate([moment for moment, _ in stretches])
     change = np.concatenate([part for _, part in stretches])
     far = [edge for moment, _ in stretches for edge in (moment[0] - FADE_S, moment[-1] + FADE_S)]
-    far = [edge for edge in far if np.abs(known - edge).min() > 0.999 * FADE_S]
+    far = [
+        edge for edge in far if np.abs(known - edge).min() > 0.999 * FADE_S
+    ]  # its own end, rounded, is no nearer
     moments = np.concatenate([known, far])
     values = np.concatenate([change, np.zeros((len(far), 6))])
     order = np.argsort(moments)

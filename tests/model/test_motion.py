@@ -123,6 +123,18 @@ def test_missing_truncated_and_foreign_files(path: Path) -> None:
             Motion.load(path)
 
 
+def test_a_damaged_byte_in_a_compressed_file_gets_one_line(path: Path) -> None:
+    with np.load(path, allow_pickle=False) as archive:
+        np.savez_compressed(path, **archive)
+    content = path.read_bytes()
+    for place in range(40, len(content), max(1, len(content) // 150)):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :])
+        try:
+            Motion.load(path)
+        except MotionError as error:
+            assert "\n" not in str(error)
+
+
 def test_pickles_are_refused(path: Path) -> None:
     rewritten(path, provenance=np.array([{"a": 1}], dtype=object))
     with pytest.raises(MotionError, match="provenance"):

@@ -104,6 +104,12 @@ def test_lips_are_not_followed_across_a_cut_nor_under_a_hand(openings: tuple[np.
     np.testing.assert_allclose(steadied(apart(read), colours, covered, TIME)[40:50], read[40:50])
 
 
+def test_times_that_are_broken_take_no_memory():
+    true = np.full((FRAMES, 9), 3.0)
+    widths = steadied(apart(true), patterned(true), ONE_RUN, np.arange(FRAMES) * 1e-9)
+    np.testing.assert_allclose(widths, true, atol=0.1)
+
+
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_a_clip_of_few_frames(count: int):
     true = np.full((count, 9), 3.0)

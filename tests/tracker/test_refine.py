@@ -16,7 +16,7 @@ from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
 from tracker.lip_lines import LipLines
 from tracker.occlusion import Appearance
 from tracker.raster import render
-from tracker.refine import _read_widths, _stretches, _with_landmarks, refine_track
+from tracker.refine import _overlap, _read_widths, _stretches, _with_landmarks, refine_track
 from tracker.skin_fit import Photometry, Subject
 from tracker.track import Bundle, Camera, Landmarks, Track
 
@@ -292,6 +292,12 @@ def test_stretches_cover_every_frame_once(total: int, overlap: int):
         assert min(held) == max(0, start - overlap) and max(held) == min(total, start + 120 + overlap) - 1
         covered += [row for row in held if start <= row < start + 120]
     assert covered == list(range(total))
+
+
+@pytest.mark.parametrize(("rate", "frames"), [(25, 8), (60, 19), (10, 8), (240, 77), (90_000, 120)])
+def test_stretches_overlap_for_a_time_and_not_beyond_what_is_solved(rate: int, frames: int):
+    assert _overlap(np.arange(50) / rate) == frames
+    assert _overlap(np.zeros(1)) == 8
 
 
 def test_a_long_clip_is_read_twice_to_the_same_end(film: Film, monkeypatch: pytest.MonkeyPatch):
