@@ -20,20 +20,20 @@ from personalize.container import probe
 from personalize.ingest import find_usable
 from personalize.pictures import read_frames
 from tracker.camera import estimate_camera
+from tracker.feature_tracks import FeatureFollower
 from tracker.head import HeadModel, load_head
 from tracker.landmarker import track_landmarks
 from tracker.track import Bundle, Camera
 
 
 def measure(path: Path, head: HeadModel) -> tuple[Camera, Bundle, float]:
-    """Camera and bundle of one video, and the seconds that the camera stage took, decoding included."""
+    """Camera and bundle of one video, and the seconds that the camera stage took."""
     frames, _ = find_usable(probe(path))
     cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
-    landmarks = track_landmarks(read_frames(path), len(frames.time), cuts)
+    follower = FeatureFollower(frames.time, frames.usable, frames.segment)
+    landmarks = track_landmarks(read_frames(path), len(frames.time), cuts, watchers=(follower,))
     start = time.perf_counter()
-    camera, bundle = estimate_camera(
-        landmarks, lambda: read_frames(path), head, usable=frames.usable, segments=frames.segment
-    )
+    camera, bundle = estimate_camera(landmarks, follower.tracks(), head)
     return camera, bundle, time.perf_counter() - start
 
 

@@ -47,6 +47,7 @@ from personalize.ingest import find_usable
 from personalize.pictures import read_frames
 from tracker.camera import estimate_camera
 from tracker.confidence import bare, judge
+from tracker.feature_tracks import FeatureFollower
 from tracker.fit import fit_track
 from tracker.head import HeadModel, load_head
 from tracker.landmarker import track_landmarks
@@ -125,12 +126,11 @@ def watched(video: Path, head: HeadModel) -> Clip:
     frames, _ = find_usable(probe(video))
     cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
     start = time.process_time()
-    watch = FaceWatch()
-    landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box, watch=watch)
+    watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment)
+    watchers = (watch, follower)
+    landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box, watchers=watchers)
     appearance = watch.appearance(frames.usable)
-    camera, bundle = estimate_camera(
-        landmarks, lambda: read_frames(video), head, usable=frames.usable, segments=frames.segment
-    )
+    camera, bundle = estimate_camera(landmarks, follower.tracks(), head)
     spent = 1e3 * (time.process_time() - start) / len(frames.time)
     return Clip(landmarks, camera, bundle, frames.usable, frames.segment, appearance, video, spent)
 

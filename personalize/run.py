@@ -17,6 +17,7 @@ from personalize.errors import UserError
 from personalize.files import read_npz, sha256_file, write_json, write_npz
 from personalize.settings import Settings
 from personalize.shots import Frames
+from tracker.feature_tracks import FeatureTracks
 from tracker.occlusion import Appearance
 from tracker.refine import Refined
 from tracker.track import Bundle, Camera, Landmarks, Track
@@ -172,6 +173,17 @@ def read_appearance(path: Path) -> Appearance:
     """Inverse of `write_appearance`."""
     data: dict[str, Any] = read_npz(path)
     return Appearance(**data)
+
+
+def write_features(path: Path, features: FeatureTracks) -> None:
+    """`landmarks/features.npz`."""
+    write_npz(path, **vars(features))
+
+
+def read_features(path: Path) -> FeatureTracks:
+    """Inverse of `write_features`."""
+    data: dict[str, Any] = read_npz(path)
+    return FeatureTracks(**data)
 
 
 def write_refined(folder: Path, refined: Refined) -> None:

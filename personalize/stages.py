@@ -27,6 +27,7 @@ from personalize.subject_data import base_path
 from personalize.tracked import read_track_of
 from tracker.camera import estimate_camera
 from tracker.confidence import bare, judge
+from tracker.feature_tracks import FeatureFollower
 from tracker.fit import fit_track
 from tracker.landmarker import track_landmarks
 from tracker.occlusion import FaceWatch
@@ -63,34 +64,35 @@ class Ingest(Stage):
 
 
 class LandmarkStage(Stage):
-    """478 points and 52 scores on every frame that shows the face, and what covers or blurs it."""
+    """478 points and 52 scores on every frame that shows the face, what covers or blurs it, and rigid features."""
 
-    name, version = "landmarks", 2
-    needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz")
+    name, version = "landmarks", 3
+    needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz", "features.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
         return {"face_landmarker": _asset_hash(LANDMARKER_FILE)}
 
     def make(self, context: Context, folder: Path) -> None:
         frames = files.read_frames(context.run.path / "ingest/frames.npz")
-        watch = FaceWatch()
+        watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment)
         landmarks = track_landmarks(
             read_frames(context.run.video),
             len(frames.time),
             cuts=set(np.flatnonzero(np.diff(frames.segment)) + 1),
             boxes=frames.box,
             progress=context.report.progress,
-            watch=watch,
+            watchers=(watch, follower),
         )
         files.write_landmarks(folder / "landmarks.npz", landmarks)
         files.write_appearance(folder / "appearance.npz", watch.appearance(frames.usable))
+        files.write_features(folder / "features.npz", follower.tracks())
 
 
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 7, ("focal_px", "distortion")
-    needs = (VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz")
+    name, version, reads = "camera", 8, ("focal_px", "distortion")
+    needs = ("landmarks/landmarks.npz", "landmarks/features.npz")
     makes = ("camera.json", "bundle.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -98,16 +100,12 @@ class CameraStage(Stage):
 
     def make(self, context: Context, folder: Path) -> None:
         root = context.run.path
-        frames = files.read_frames(root / "ingest/frames.npz")
         camera, bundle = estimate_camera(
             files.read_landmarks(root / "landmarks/landmarks.npz"),
-            lambda: read_frames(context.run.video),
+            files.read_features(root / "landmarks/features.npz"),
             run_head(context.settings),
             focal_given=context.settings.focal_px,
             distortion=context.settings.distortion,
-            usable=frames.usable,
-            segments=frames.segment,
-            progress=context.report.progress,
         )
         files.write_camera(folder, camera, bundle)
 

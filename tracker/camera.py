@@ -8,7 +8,6 @@ the rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracker.bundle_adjustment import RigidScene, absolute_pose, adjust, camera_model
-from tracker.feature_tracks import FeatureTracks, Frame, track_features, turning
+from tracker.feature_tracks import FeatureTracks, turning
 from tracker.head import HeadModel, LandmarkEmbedding
 from tracker.key_frames import farthest
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, STEADY_CORNERS, UPPER_FACE
@@ -40,25 +39,18 @@ ADJUSTED, MOST_POINTS = 250, 600  # frames and points adjusted together: the tim
 
 def estimate_camera(
     landmarks: Landmarks,
-    frames: Callable[[], Iterable[Frame]],
+    features: FeatureTracks,
     head: HeadModel,
     focal_given: float | None = None,
     distortion: tuple[float, ...] = (),
-    usable: NDArray[np.bool_] | None = None,
-    segments: NDArray[np.int32] | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Camera, Bundle]:
     """The camera of one clip and the rigid evidence for it, in the frame of the mean head.
 
-    frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for each row of the landmarks. focal_given: px,
-    then nothing is estimated but poses and points. distortion: its radial coefficients, see `Lens`.
-    usable: [T] bool. segments: [T], number of the uninterrupted shot.
+    features: what was followed through the frames of the landmarks. focal_given: px, then nothing is estimated but
+    poses and points. distortion: its radial coefficients, see `Lens`.
     """
-    total = len(landmarks.time)
-    usable = np.ones(total, bool) if usable is None else usable
-    segments = np.zeros(total, np.int32) if segments is None else segments
     prior = _camera(landmarks.size, focal_given, distortion)
-    tracks = _straight(track_features(frames(), landmarks, usable, segments, progress), prior)
+    tracks = _straight(features, prior)
     some = tracks.select(_telling(landmarks.points[tracks.frames]), MOST_POINTS)
     start, surface, kept = _start(some, landmarks, head, prior)
     if not len(kept):

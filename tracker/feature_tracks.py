@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -11,23 +10,20 @@ from numpy.typing import NDArray
 
 from tracker.landmark_indices import LEFT_EYE, LEFT_EYE_OUTER, RIGHT_EYE, RIGHT_EYE_OUTER, UPPER_FACE
 from tracker.patch_registration import NO_TEMPLATES, cut_templates, fine_texture, register
-from tracker.track import F32, F64, Landmarks
+from tracker.track import F32, F64
 
 SPACING_S = 0.12  # between the frames that are followed: about every third at 25 fps
-MIN_PRESENCE = 0.5
 CORNERS = 250  # wanted in a picture
 # A patch that was looked for so often, and found in less than one in so many, is given up: of a clip of an hour there
 # would be more of them than can be looked for.
 PATIENCE = 10
 REPLENISH = 5  # followed frames between searches for new corners
-EYE_DISTANCE = (
-    160.0  # px between the outer eye corners, at most: a larger face is followed in a smaller picture
-)
+# px between the outer eye corners, about: a larger face is followed in a picture shrunk by whole GRID-ths.
+EYE_DISTANCE, GRID = 160.0, 16
+AROUND = 48.0  # px around the upper face: patches' halves, their search and what the texture's blurs reach
 REACH = 0.35  # eye distances, of the landmarks that carry a patch along
 MIN_SHRINK = 0.3  # of its area: a patch seen more aslant is not looked for
 MIN_LENGTH = 5  # observations of a track that is kept
-
-Frame = tuple[float, NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -59,26 +55,6 @@ class FeatureTracks:
         return FeatureTracks(frames, seen[np.isin(number, chosen)])
 
 
-def followed_frames(
-    landmarks: Landmarks, usable: NDArray[np.bool_], segments: NDArray[np.int32]
-) -> NDArray[np.int32]:
-    """[M] frames to follow: the first of each shot in which a face is seen, then one about every SPACING_S.
-
-    usable: [T] bool. segments: [T], number of the uninterrupted shot.
-    """
-    good = np.flatnonzero(usable & (landmarks.presence >= MIN_PRESENCE))
-    interval = float(np.median(np.diff(landmarks.time))) if len(landmarks.time) > 1 else 0.0
-    chosen: list[int] = []
-    for frame in good.tolist():
-        if (
-            not chosen
-            or segments[frame] != segments[chosen[-1]]
-            or landmarks.time[frame] - landmarks.time[chosen[-1]] > SPACING_S - interval / 2
-        ):
-            chosen.append(frame)
-    return np.array(chosen, np.int32)
-
-
 def turning(points: NDArray[np.floating]) -> NDArray[np.floating]:
     """[n, 2] where the nose tip lies against the eyes, in eye distances: grows with the turn of the head."""
     right, left = points[:, RIGHT_EYE_OUTER, :2], points[:, LEFT_EYE_OUTER, :2]
@@ -87,36 +63,6 @@ def turning(points: NDArray[np.floating]) -> NDArray[np.floating]:
     nose = points[:, 1, :2] - (left + right) / 2
     size = (across**2).sum(1, keepdims=True)
     return np.stack([(nose * across).sum(1), (nose * down).sum(1)], axis=1) / size
-
-
-def track_features(
-    frames: Iterable[Frame],
-    landmarks: Landmarks,
-    usable: NDArray[np.bool_],
-    segments: NDArray[np.int32],
-    progress: Callable[[int, int], None] | None = None,
-) -> FeatureTracks:
-    """Follows about CORNERS corners of the rigid upper face through the clip, its cuts included: it stays one face.
-
-    frames: (time s, rgb [H, W, 3] u8), as many as the landmarks. usable: [T] bool. segments: [T], number of the
-    uninterrupted shot.
-    """
-    chosen = followed_frames(landmarks, usable, segments)
-    total = len(landmarks.time)
-    eyes = landmarks.points[chosen][:, [RIGHT_EYE_OUTER, LEFT_EYE_OUTER], :2]
-    distance = float(np.median(np.linalg.norm(eyes[:, 0] - eyes[:, 1], axis=-1))) if len(chosen) else 1.0
-    follower = _Follower(min(1.0, EYE_DISTANCE / distance))
-    wanted = set(chosen.tolist())
-    rows = []
-    for index, (_, rgb) in enumerate(frames):
-        if progress is not None:
-            progress(index + 1, total)
-        if index not in wanted:
-            continue
-        tracks, xy = follower.next(rgb, landmarks.points[index, :, :2])
-        rows.append(np.column_stack([np.full(len(tracks), index), tracks, xy]))
-    observations = _long_tracks(np.concatenate(rows) if rows else np.zeros((0, 4)))
-    return FeatureTracks(chosen, observations)
 
 
 def _long_tracks(observations: NDArray[np.float64]) -> F32:
@@ -128,15 +74,53 @@ def _long_tracks(observations: NDArray[np.float64]) -> F32:
     return kept.astype(np.float32)
 
 
-class _Follower:
-    """Patches and where they were last, in a picture scaled by `scale`.
+@dataclass(frozen=True)
+class _Part:
+    """The upper face of a shrunk picture, [h, w] px from its `corner` [2] on; mask: see `upper_face_mask`."""
 
-    A patch is looked for in each picture as it was first seen, bent as the landmarks around it moved: its error does
-    not grow with time, and it is found again after it was hidden.
+    corner: NDArray[np.int64]
+    texture: F32
+    mask: NDArray[np.uint8]
+
+    def shows(self, xy: F64) -> NDArray[np.bool_]:
+        """[n] whether the upper face is at xy [n, 2] px of the shrunk picture; beyond a part its border counts."""
+        within = np.nan_to_num(xy).round().astype(int) - self.corner
+        x, y = np.clip(within, 0, np.array(self.mask.shape[::-1]) - 1).T
+        return self.mask[y, x] > 0
+
+
+def _part(rgb: NDArray[np.uint8], face: F32, scale: float) -> _Part:
+    """Around the upper face of landmarks `face` [478, 2] px of the picture shrunk to `scale`, a multiple of 1 / GRID.
+
+    In steps of GRID px a part shrinks to whole pixels, and to the same as if the whole picture were shrunk.
+    """
+    upper, whole = face[list(UPPER_FACE)], np.maximum(np.array(rgb.shape[1::-1]) // GRID, 1)
+    low = np.clip(np.floor((upper.min(0) - AROUND) / scale / GRID), 0, whole - 1).astype(np.int64)
+    high = np.clip(np.ceil((upper.max(0) + AROUND) / scale / GRID), low + 1, whole).astype(np.int64)
+    left, top, right, bottom = GRID * np.concatenate([low, high])
+    gray = cv2.cvtColor(rgb[top:bottom, left:right], cv2.COLOR_RGB2GRAY)
+    corner = np.round(GRID * scale * low).astype(np.int64)
+    if scale < 1:
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return _Part(corner, fine_texture(gray), upper_face_mask(face - corner.astype(np.float32), gray.shape))
+
+
+class FeatureFollower:
+    """Follows about CORNERS corners of the rigid upper face through a clip, its cuts included: it stays one face.
+
+    It looks at each picture while its landmarks are read, with no pass over the video of its own. A patch is looked for
+    as it was first seen, bent as the landmarks around it moved: its error does not grow with time, and it is found
+    again after it was hidden. Places are in px of the shrunk picture.
     """
 
-    def __init__(self, scale: float) -> None:
-        self._scale = scale
+    def __init__(self, time: F64, usable: NDArray[np.bool_], segments: NDArray[np.int32]) -> None:
+        """time: [T] s. usable: [T]. segments: [T], number of the uninterrupted shot."""
+        self._time, self._usable, self._segments = time, usable, segments
+        self._step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        self._seen = 0
+        self._scale = np.nan
+        self._frames: list[int] = []
+        self._observations = [np.zeros((0, 4))]
         self._templates = NO_TEMPLATES
         self._begun_count = 0
         self._numbers = np.zeros(0, np.int64)
@@ -144,36 +128,58 @@ class _Follower:
         self._face = np.zeros((0, len(UPPER_FACE), 2))  # px, the landmarks there
         self._offset = np.zeros((0, 2))  # px, from where the landmarks put it to where it was last
         self._tries, self._finds = np.zeros(0, np.int64), np.zeros(0, np.int64)
-        self._age = 0
 
-    def next(self, rgb: NDArray[np.uint8], points: F32) -> tuple[NDArray[np.int64], F32]:
-        """Numbers [n] and places [n, 2] px of the patches seen in this picture; points: landmarks [478, 2] px."""
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-        if self._scale < 1:
-            gray = cv2.resize(gray, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA)
-        scale = np.array(gray.shape[::-1]) / np.array(rgb.shape[1::-1])
-        face = ((points + 0.5) * scale - 0.5).astype(np.float32)
-        region, texture = upper_face_mask(face, gray.shape), fine_texture(gray)
-        rows, xy = self._found(texture, face, region)
+    def see(self, rgb: NDArray[np.uint8], points: F32) -> None:
+        """The next picture [H, W, 3] and its landmarks [478, 3] px, NaN where there is no face."""
+        index, self._seen = self._seen, self._seen + 1
+        if not self._due(index) or not np.isfinite(points).all():
+            return
+        if not self._frames:
+            # The depth between them counts as well: at the first sight the head may be turned.
+            eyes = float(np.linalg.norm(points[LEFT_EYE_OUTER] - points[RIGHT_EYE_OUTER]))
+            self._scale = float(np.clip(round(GRID * EYE_DISTANCE / max(eyes, 1.0)), 1, GRID)) / GRID
+        face = ((points[:, :2] + 0.5) * self._scale - 0.5).astype(np.float32)
+        numbers, xy = self._followed(_part(rgb, face, self._scale), face)
+        self._frames.append(index)
+        places = (xy + 0.5) / self._scale - 0.5
+        self._observations.append(np.column_stack([np.full(len(numbers), index), numbers, places]))
+
+    def tracks(self) -> FeatureTracks:
+        """What was followed through the pictures seen, where it is long enough to tell anything."""
+        observations = _long_tracks(np.concatenate(self._observations))
+        return FeatureTracks(np.array(self._frames, np.int32), observations)
+
+    def _due(self, frame: int) -> bool:
+        """Whether to follow into a frame, if it shows a face: the first of each shot, then about every SPACING_S."""
+        if not self._usable[frame] or not self._frames:
+            return bool(self._usable[frame])
+        last = self._frames[-1]
+        late = self._time[frame] - self._time[last] > SPACING_S - self._step / 2
+        return bool(late or self._segments[frame] != self._segments[last])
+
+    def _followed(self, part: _Part, face: F32) -> tuple[NDArray[np.int64], F64]:
+        """Numbers [n] and places [n, 2] of the patches seen in a picture with landmarks `face` [478, 2]."""
+        rows, xy = self._found(part, face)
         numbers = self._numbers[rows]
-        if self._age % REPLENISH == 0:
+        if len(self._frames) % REPLENISH == 0:
             self._give_up()
-            more, places = self._replenished(texture, face, region, xy)
+            more, places = self._replenished(part, face, xy)
             numbers, xy = np.concatenate([numbers, more]), np.concatenate([xy, places])
-        self._age += 1
-        return numbers, ((xy + 0.5) / scale - 0.5).astype(np.float32)
+        return numbers, xy
 
-    def _found(self, texture: F32, face: F32, region: NDArray[np.uint8]) -> tuple[NDArray[np.int64], F64]:
-        """Rows [n] of the patches seen again, and where [n, 2] px."""
+    def _found(self, part: _Part, face: F32) -> tuple[NDArray[np.int64], F64]:
+        """Rows [n] of the patches seen again, and where [n, 2]."""
         if not len(self._numbers):
             return np.zeros(0, np.int64), np.zeros((0, 2))
         reach = REACH * float(np.linalg.norm(face[LEFT_EYE_OUTER] - face[RIGHT_EYE_OUTER]))
         expected, bend = _carried(self._begun, self._face, face[list(UPPER_FACE)].astype(np.float64), reach)
         guess = expected + self._offset
-        rows = np.flatnonzero(_inside(region, guess) & (np.linalg.det(bend) > MIN_SHRINK))
+        rows = np.flatnonzero(part.shows(guess) & (np.linalg.det(bend) > MIN_SHRINK))
         self._tries[rows] += 1
-        xy, found = register(texture, guess[rows], bend[rows], self._templates.select(rows))
-        found &= _inside(region, xy)
+        within = guess[rows] - part.corner
+        xy, found = register(part.texture, within, bend[rows], self._templates.select(rows))
+        xy += part.corner
+        found &= part.shows(xy)
         rows, xy = rows[found], xy[found]
         self._finds[rows] += 1
         self._offset[rows] = xy - expected[rows]
@@ -186,25 +192,23 @@ class _Follower:
         for name in ("_numbers", "_begun", "_face", "_offset", "_tries", "_finds"):
             setattr(self, name, getattr(self, name)[hopeful])
 
-    def _replenished(
-        self, texture: F32, face: F32, region: NDArray[np.uint8], seen: F64
-    ) -> tuple[NDArray[np.int64], F64]:
-        """Numbers [n] and places [n, 2] px of new patches where none of those seen [k, 2] px is."""
+    def _replenished(self, part: _Part, face: F32, seen: F64) -> tuple[NDArray[np.int64], F64]:
+        """Numbers [n] and places [n, 2] of new patches where none of those seen [k, 2] is."""
         wanted = CORNERS - len(seen)
-        # Evenly over the region: as many corners as fit at this distance.
-        apart = max(2.0, 0.7 * np.sqrt(np.count_nonzero(region) / CORNERS))
-        free = region.copy()
-        for x, y in seen.round().astype(int):
+        # Evenly over the upper face: as many corners as fit at this distance.
+        apart = max(2.0, 0.7 * np.sqrt(np.count_nonzero(part.mask) / CORNERS))
+        free = part.mask.copy()
+        for x, y in (seen - part.corner).round().astype(int):
             cv2.circle(free, (int(x), int(y)), round(apart), 0, -1)
         corners = None
         if wanted > 0:
-            corners = cv2.goodFeaturesToTrack(texture, wanted, 0.002, apart, mask=free, blockSize=5)
+            corners = cv2.goodFeaturesToTrack(part.texture, wanted, 0.002, apart, mask=free, blockSize=5)
         if corners is None:
             return np.zeros(0, np.int64), np.zeros((0, 2))
-        places = corners.reshape(-1, 2).astype(np.float64)
-        templates = cut_templates(texture, places)
+        within = corners.reshape(-1, 2).astype(np.float64)
+        templates = cut_templates(part.texture, within)
         sound = templates.corners()
-        places, count = places[sound], int(sound.sum())
+        places, count = within[sound] + part.corner, int(sound.sum())
         numbers = self._begun_count + np.arange(count)
         self._begun_count += count
         self._numbers = np.concatenate([self._numbers, numbers])
@@ -231,11 +235,6 @@ def _carried(xy: F64, before: F64, now: F64, reach: float) -> tuple[F64, F64]:
     spread = np.einsum("nl,nli,nlj->nij", weight, old, old)
     bend = np.einsum("nl,nli,nlj->nij", weight, new, old) @ np.linalg.inv(spread)
     return goal + np.einsum("nij,nj->ni", bend, xy - centre), bend
-
-
-def _inside(region: NDArray[np.uint8], xy: F64) -> NDArray[np.bool_]:
-    x, y = np.clip(np.nan_to_num(xy).round().astype(int), 0, np.array(region.shape[::-1]) - 1).T
-    return region[y, x] > 0
 
 
 def upper_face_mask(points: F32, shape: tuple[int, ...]) -> NDArray[np.uint8]:

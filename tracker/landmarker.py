@@ -12,7 +12,7 @@ import zipfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -29,9 +29,6 @@ from tracker.landmark_indices import (
 )
 from tracker.networks import open_network
 from tracker.track import F32, Landmarks
-
-if TYPE_CHECKING:
-    from tracker.occlusion import FaceWatch
 
 INPUT_SIZE = 256  # px, side of the landmark network's square input
 MARGIN = 1.5  # side of the region over the long side of the face's box
@@ -233,20 +230,27 @@ def _inside(point: NDArray[np.floating], box: F32) -> bool:
     return bool((point >= box[:2]).all() and (point <= box[2:]).all())
 
 
+class Watcher(Protocol):
+    """Learns something else from the pictures while landmarks are read, with no pass over the video of its own."""
+
+    def see(self, rgb: NDArray[np.uint8], points: F32, /) -> None:
+        """The next picture [H, W, 3] and its landmarks [478, 3] px, NaN where there is no face."""
+
+
 def track_landmarks(
     frames: Iterable[tuple[float, NDArray[np.uint8]]],
     total: int,
     cuts: set[int] | None = None,
     boxes: F32 | None = None,
     progress: Callable[[int, int], None] | None = None,
-    watch: FaceWatch | None = None,
+    watchers: Iterable[Watcher] = (),
 ) -> Landmarks:
     """Landmarks of a whole clip.
 
     frames: (time s, rgb [H, W, 3] u8) in order, all of one size, at least one. total: how many, for progress.
     cuts: indices of frames that begin another shot, where nothing is taken over from the frame before.
     boxes: [T, 4] px, left, top, right, bottom of the face that is meant, NaN where it is not known.
-    watch: sees each picture with its landmarks.
+    watchers: see each picture with its landmarks.
     """
     tracker = LandmarkTracker(FaceLandmarker())
     times: list[float] = []
@@ -260,8 +264,8 @@ def track_landmarks(
         box = None if boxes is None or np.isnan(boxes[index]).any() else boxes[index]
         rows.append(tracker.next(rgb, box) or nothing)
         size = (rgb.shape[1], rgb.shape[0])
-        if watch is not None:
-            watch.see(rgb, rows[-1][0])
+        for watcher in watchers:
+            watcher.see(rgb, rows[-1][0])
         if progress is not None:
             progress(index + 1, total)
     assert rows, "a clip without frames"

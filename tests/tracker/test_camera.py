@@ -8,16 +8,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import tracker.camera as subject
+from tracker import feature_tracks
 from tracker.camera import PRIOR_FOCAL, PRIOR_SD_LOG, estimate_camera
 from tracker.feature_tracks import (
+    FeatureFollower,
     FeatureTracks,
-    _Follower,
-    followed_frames,
-    track_features,
     upper_face_mask,
 )
 from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import LEFT_EYE, POINTS, RIGHT_EYE, UPPER_FACE
+from tracker.patch_registration import fine_texture
 from tracker.raster import project
 from tracker.track import F64, Landmarks
 
@@ -82,14 +82,9 @@ def _talk(
     return _clip(landmarks), tracks, turns
 
 
-def _given(tracks: FeatureTracks, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(subject, "track_features", lambda *_: tracks)
-
-
-def test_a_turning_head_tells_focal_length_and_pose(head: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_turning_head_tells_focal_length_and_pose(head: HeadModel) -> None:
     marks, tracks, turns = _talk(head, 18)
-    _given(tracks, monkeypatch)
-    camera, bundle = estimate_camera(marks, lambda: [], head)
+    camera, bundle = estimate_camera(marks, tracks, head)
     assert camera.method == "bundle" and camera.focal_sd_log < 0.2
     assert abs(np.log(camera.focal_px / FOCAL)) < min(0.12, 2.5 * camera.focal_sd_log)
     between = Rotation.from_matrix(turns[bundle.frame]).inv() * Rotation.from_rotvec(bundle.rotation)
@@ -101,27 +96,26 @@ def test_a_turning_head_tells_focal_length_and_pose(head: HeadModel, monkeypatch
     assert np.median(np.abs(error)) < 0.3
 
 
-def test_a_still_head_leaves_the_prior(head: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_still_head_leaves_the_prior(head: HeadModel) -> None:
     marks, tracks, _ = _talk(head, 0.5)
-    _given(tracks, monkeypatch)
-    camera, bundle = estimate_camera(marks, lambda: [], head)
+    camera, bundle = estimate_camera(marks, tracks, head)
     assert (camera.method, camera.focal_px, camera.focal_sd_log) == ("prior", PRIOR_FOCAL * 640, PRIOR_SD_LOG)
     assert "832 px" in camera.prior
     assert len(bundle.frame) == len(marks.time) and np.isfinite(bundle.points).all()
     assert (bundle.translation[:, 2] > 0.2).all() and (bundle.translation[:, 2] < 1).all()
 
 
-def test_a_given_lens_is_taken_out(head: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_given_lens_is_taken_out(head: HeadModel) -> None:
     marks, tracks, _ = _talk(head, 15)
-    _given(tracks, monkeypatch)
-    _, straight = estimate_camera(marks, lambda: [], head, focal_given=FOCAL)
+    _, straight = estimate_camera(marks, tracks, head, focal_given=FOCAL)
     k1 = -0.4
     points, seen = marks.points.copy(), tracks.observations.copy()
     points[..., :2], seen[:, 2:] = _bent(points[..., :2], k1), _bent(seen[:, 2:], k1)
     assert np.abs(points - marks.points).max() > 1.5
-    _given(replace(tracks, observations=seen), monkeypatch)
     camera, bundle = estimate_camera(
-        replace(marks, points=points), lambda: [], head, focal_given=FOCAL, distortion=(k1,)
+        *(replace(marks, points=points), replace(tracks, observations=seen), head),
+        focal_given=FOCAL,
+        distortion=(k1,),
     )
     assert camera.distortion == (k1,)
     between = Rotation.from_rotvec(straight.rotation).inv() * Rotation.from_rotvec(bundle.rotation)
@@ -135,77 +129,83 @@ def _bent(xy: np.ndarray, k1: float) -> np.ndarray:
     return CENTRE + FOCAL * from_centre * (1 + k1 * (from_centre**2).sum(-1, keepdims=True))
 
 
-def test_a_given_focal_length_is_kept(head: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_given_focal_length_is_kept(head: HeadModel) -> None:
     marks, tracks, _ = _talk(head, 15)
-    _given(tracks, monkeypatch)
-    camera, bundle = estimate_camera(marks, lambda: [], head, focal_given=1000.0)
+    camera, bundle = estimate_camera(marks, tracks, head, focal_given=1000.0)
     assert (camera.method, camera.focal_px, camera.focal_sd_log) == ("given", 1000.0, 0.0)
     assert len(bundle.points) and len(bundle.frame) == len(marks.time)
     marks, tracks, turns = _talk(head, 0.5)
-    _given(tracks, monkeypatch)
-    camera, bundle = estimate_camera(marks, lambda: [], head, focal_given=1000.0)
+    camera, bundle = estimate_camera(marks, tracks, head, focal_given=1000.0)
     assert camera.method == "given"
     between = Rotation.from_matrix(turns[bundle.frame]).inv() * Rotation.from_rotvec(bundle.rotation)
     assert np.degrees((between.mean().inv() * between).magnitude().max()) < 0.2
 
 
-def test_shots_that_share_no_patch_share_the_focal_length(
-    head: HeadModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shots_that_share_no_patch_share_the_focal_length(head: HeadModel) -> None:
     marks, tracks, _ = _talk(head, 18)
     half = tracks.observations[:, 0] >= 20
     rows = tracks.observations.copy()
     rows[half, 1] += rows[:, 1].max() + 1
     rows[:, 1] = np.unique(rows[:, 1], return_inverse=True)[1]
-    _given(FeatureTracks(tracks.frames, rows), monkeypatch)
-    camera, bundle = estimate_camera(marks, lambda: [], head)
+    camera, bundle = estimate_camera(marks, FeatureTracks(tracks.frames, rows), head)
     assert abs(np.log(camera.focal_px / FOCAL)) < 0.25
     assert len(bundle.frame) == 40 and np.isfinite(bundle.translation).all()
 
 
-def test_without_tracks_or_faces_the_prior_stands(head: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_tracks_or_faces_the_prior_stands(head: HeadModel) -> None:
     marks, tracks, _ = _talk(head, 15)
     for frames in (tracks.frames, np.zeros(0, np.int32)):
-        _given(FeatureTracks(frames, np.zeros((0, 4), np.float32)), monkeypatch)
-        camera, bundle = estimate_camera(marks, lambda: [], head)
+        nothing = FeatureTracks(frames, np.zeros((0, 4), np.float32))
+        camera, bundle = estimate_camera(marks, nothing, head)
         assert camera.method == "prior" and bundle.rotation.shape == bundle.points.shape == (0, 3)
     # Poses of the mean head's landmarks are no evidence that could take the place of the fit's.
-    _, bundle = estimate_camera(marks, lambda: [], head, focal_given=1000.0)
+    _, bundle = estimate_camera(marks, nothing, head, focal_given=1000.0)
     assert len(bundle.frame) == 0
 
 
-def test_frames_in_glasses_are_no_skin(head: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_in_glasses_are_no_skin(head: HeadModel) -> None:
     """Every fourth point hangs 15 mm before the face, and every tenth track slides off."""
     marks, tracks, turns = _talk(head, 18, before_m=0.015)
     rows = tracks.observations
     sliding = rows[:, 1] % 10 == 0
     rows[sliding, 2] += 0.3 * rows[sliding, 0]
-    _given(tracks, monkeypatch)
-    camera, bundle = estimate_camera(marks, lambda: [], head)
+    camera, bundle = estimate_camera(marks, tracks, head)
     assert abs(np.log(camera.focal_px / FOCAL)) < 2.5 * camera.focal_sd_log < 0.5
     between = Rotation.from_matrix(turns[bundle.frame]).inv() * Rotation.from_rotvec(bundle.rotation)
     assert np.degrees((between.mean().inv() * between).magnitude().mean()) < 0.5
+
+
+def _followed(
+    time: np.ndarray, usable: np.ndarray, segments: np.ndarray, unseen: np.ndarray | None = None
+) -> np.ndarray:
+    """Which frames of a clip are followed whose pictures show nothing; unseen: [T] those without a face."""
+    follower = FeatureFollower(time, usable, segments)
+    for frame in range(len(time)):
+        lost = unseen is not None and unseen[frame]
+        follower.see(np.zeros((32, 32, 3), np.uint8), np.full((POINTS, 3), np.nan if lost else 0, np.float32))
+    return follower.tracks().frames
 
 
 def test_frames_are_followed_at_an_even_pace_in_every_shot() -> None:
     total = 600
     usable, segments = np.ones(total, bool), (np.arange(total) // 70).astype(np.int32)
     usable[400:411] = False
-    clip = _clip(np.zeros((total, POINTS, 3)))
-    frames = followed_frames(clip, usable, segments)
+    time = np.arange(total) / 25
+    frames = _followed(time, usable, segments)
     assert usable[frames].all() and set(np.unique(segments)) == set(segments[frames])
     assert {70 * shot for shot in range(9)} <= set(frames.tolist())
     together = np.diff(segments[frames]) == 0
     assert set(np.diff(frames)[together]) == {3, 13}  # 13: over the frames that show no face
-    assert len(followed_frames(clip, np.zeros(total, bool), segments)) == 0
+    assert len(_followed(time, np.zeros(total, bool), segments)) == 0
+    unseen = np.arange(total) < 100
+    assert _followed(time, usable, segments, unseen).min() == 100
 
 
 def test_pictures_that_stand_still_do_not_change_the_pace() -> None:
     """Film shown twice as fast: every second picture is a repeat, and not usable."""
     total = 600
     usable = np.arange(total) % 2 == 0
-    clip = replace(_clip(np.zeros((total, POINTS, 3))), time=np.arange(total) / 50)
-    frames = followed_frames(clip, usable, np.zeros(total, np.int32))
+    frames = _followed(np.arange(total) / 50, usable, np.zeros(total, np.int32))
     assert usable[frames].all() and set(np.diff(frames)) == {6}
 
 
@@ -213,14 +213,13 @@ def test_a_long_clip_is_told_by_some_frames_and_its_turns_are_among_them(
     head: HeadModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     marks, tracks, turns = _talk(head, 18, total=80)
-    _given(tracks, monkeypatch)
     monkeypatch.setattr(subject, "ADJUSTED", 30)
     telling = subject._telling(marks.points)
     assert len(telling) == 30 and {0, 79} <= set(telling.tolist())
     nose = subject.turning(marks.points)
     for farthest in (nose[:, 0].argmin(), nose[:, 0].argmax()):
         assert np.abs(telling - farthest).min() <= 1
-    camera, bundle = estimate_camera(marks, lambda: [], head)
+    camera, bundle = estimate_camera(marks, tracks, head)
     assert camera.method == "bundle" and bundle.frame.tolist() == list(range(80))
     between = Rotation.from_matrix(turns).inv() * Rotation.from_rotvec(bundle.rotation)
     error = np.degrees((between.mean().inv() * between).magnitude())
@@ -283,7 +282,10 @@ def test_tracks_follow_the_picture_and_over_a_cut_the_same_face_alone(same_face:
         (i / 25, cv2.warpAffine(faces[shot], np.float32([[1, 0, x], [0, 1, y]]), (640, 480)))
         for i, (shot, (x, y)) in enumerate(zip(segments, shift))
     ]
-    tracks = track_features(pictures, _clip(points), np.ones(total, bool), segments)
+    follower = FeatureFollower(np.arange(total) / 25, np.ones(total, bool), segments)
+    for (_, picture), marks in zip(pictures, points):
+        follower.see(picture, marks.astype(np.float32))
+    tracks = follower.tracks()
     rows = tracks.observations
     assert len(tracks.frames) == 10 and len(rows) > 500
     numbers = rows[:, 1].astype(int)
@@ -304,12 +306,32 @@ def test_tracks_follow_the_picture_and_over_a_cut_the_same_face_alone(same_face:
 def test_patches_that_are_never_found_again_are_given_up() -> None:
     """Pictures of noise: none looks like the one before."""
     rng = np.random.default_rng(0)
-    follower = _Follower(1.0)
-    face = _face().astype(np.float32)
-    held, numbers = [], []
+    follower = FeatureFollower(np.arange(60) / 8, np.ones(60, bool), np.zeros(60, np.int32))
+    face = np.column_stack([_face(), np.zeros(POINTS)]).astype(np.float32)
+    held = []
     for _ in range(60):
         noise = cv2.GaussianBlur(rng.integers(0, 255, (480, 640, 3), dtype=np.uint8), (0, 0), 2)
-        seen, _ = follower.next(cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX), face)
+        follower.see(cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX), face)
         held.append(len(follower._numbers))
-        numbers.extend(seen.tolist())
-    assert max(held) < 600 and max(numbers) > 2500
+    assert max(held) < 600 and follower._numbers.max() > 2500
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (-220, 90), (230, -130)])
+@pytest.mark.parametrize("scale", [1.0, 0.75, 0.3125])
+def test_a_part_of_a_picture_is_like_that_of_the_whole_one_shrunk(
+    scale: float, shift: tuple[int, int]
+) -> None:
+    """Also of a face at the picture's rim, and beyond it."""
+    rng = np.random.default_rng(0)
+    noise = cv2.GaussianBlur(rng.integers(0, 255, (480, 640, 3), dtype=np.uint8), (0, 0), 2)
+    face = ((_face() + shift + 0.5) * scale - 0.5).astype(np.float32)
+    part = feature_tracks._part(noise, face, scale)
+    gray = cv2.cvtColor(noise, cv2.COLOR_RGB2GRAY)
+    size = (round(640 * scale), round(480 * scale))
+    whole = fine_texture(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+    mask = upper_face_mask(face, whole.shape)
+    (x, y), (height, width) = part.corner, part.mask.shape
+    np.testing.assert_array_equal(part.mask, mask[y : y + height, x : x + width])
+    assert np.count_nonzero(part.mask) == np.count_nonzero(mask) > 0
+    shown = part.mask > 0
+    np.testing.assert_allclose(part.texture[shown], whole[y : y + height, x : x + width][shown], atol=0.02)

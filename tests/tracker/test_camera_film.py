@@ -1,6 +1,5 @@
 """Camera, end to end on a filmed head: from pixels to focal length, and clips that give nothing."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import cv2
@@ -12,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tracker.bundle_adjustment import RigidScene, _Problem, _State, absolute_pose, adjust, camera_model
 from tracker.camera import PRIOR_FOCAL, PRIOR_SD_LOG, estimate_camera
-from tracker.feature_tracks import track_features
+from tracker.feature_tracks import FeatureFollower, FeatureTracks
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
 from tracker.patch_registration import cut_templates, fine_texture, register
@@ -73,8 +72,12 @@ def landmarks_of(points: NDArray[np.float32]) -> Landmarks:
     return Landmarks(np.arange(count) / FPS, points, presence, scores, BLENDSHAPE_NAMES, SIZE)
 
 
-def again(pictures: list) -> Callable[[], Iterable]:
-    return lambda: iter(pictures)
+def followed(landmarks: Landmarks, pictures: list, usable: NDArray[np.bool_] | None = None) -> FeatureTracks:
+    everywhere = np.ones(COUNT, bool) if usable is None else usable
+    follower = FeatureFollower(landmarks.time, everywhere, np.zeros(COUNT, np.int32))
+    for (_, rgb), points in zip(pictures, landmarks.points):
+        follower.see(rgb, points)
+    return follower.tracks()
 
 
 def assert_prior(camera: Camera) -> None:
@@ -90,7 +93,7 @@ def turning() -> Clip:
 
 @pytest.fixture(scope="module")
 def found(turning):
-    return estimate_camera(turning[0], again(turning[1]), HEAD)
+    return estimate_camera(turning[0], followed(*turning[:2]), HEAD)
 
 
 def test_a_turning_head_tells_the_focal_length(found):
@@ -116,7 +119,7 @@ def test_points_lie_on_the_head_and_project_to_what_was_seen(found):
 
 
 def test_the_same_clip_gives_the_same_camera(turning, found):
-    camera, bundle = estimate_camera(turning[0], again(turning[1]), HEAD)
+    camera, bundle = estimate_camera(turning[0], followed(*turning[:2]), HEAD)
     assert camera == found[0]
     for name in ("frame", "rotation", "translation", "points", "observations"):
         assert np.array_equal(getattr(bundle, name), getattr(found[1], name)), name
@@ -124,14 +127,14 @@ def test_the_same_clip_gives_the_same_camera(turning, found):
 
 def test_a_still_head_leaves_the_prior():
     landmarks, pictures, _ = film((0.5, 1.0, 0.3))
-    camera, bundle = estimate_camera(landmarks, again(pictures), HEAD)
+    camera, bundle = estimate_camera(landmarks, followed(landmarks, pictures), HEAD)
     assert_prior(camera)
     assert np.isfinite(bundle.translation).all() and (bundle.translation[:, 2] > 0).all()
 
 
 def test_a_picture_without_corners_leaves_the_prior(turning):
     blank = [(time, np.full_like(rgb, 128)) for time, rgb in turning[1]]
-    camera, bundle = estimate_camera(turning[0], again(blank), HEAD)
+    camera, bundle = estimate_camera(turning[0], followed(turning[0], blank), HEAD)
     assert_prior(camera)
     assert len(bundle.points) == len(bundle.observations) == 0
 
@@ -140,7 +143,7 @@ def test_no_face_or_no_usable_frame_leaves_the_prior(turning):
     gone = landmarks_of(np.full_like(turning[0].points, np.nan))
     nothing = np.zeros(COUNT, bool)
     for landmarks, usable in ((gone, None), (turning[0], nothing)):
-        camera, bundle = estimate_camera(landmarks, again(turning[1]), HEAD, usable=usable)
+        camera, bundle = estimate_camera(landmarks, followed(landmarks, turning[1], usable), HEAD)
         assert_prior(camera)
         assert bundle.rotation.shape == bundle.translation.shape == bundle.points.shape == (0, 3)
         assert bundle.observations.shape == (0, 4)
@@ -149,7 +152,8 @@ def test_no_face_or_no_usable_frame_leaves_the_prior(turning):
 def test_frames_without_a_face_have_no_pose(turning):
     points = turning[0].points.copy()
     points[10:14] = np.nan
-    camera, bundle = estimate_camera(landmarks_of(points), again(turning[1]), HEAD)
+    landmarks = landmarks_of(points)
+    camera, bundle = estimate_camera(landmarks, followed(landmarks, turning[1]), HEAD)
     assert not np.isin(np.arange(10, 14), bundle.frame).any() and len(bundle.frame)
     assert np.isfinite(camera.focal_px)
 
@@ -157,8 +161,7 @@ def test_frames_without_a_face_have_no_pose(turning):
 def test_tracks_stay_on_the_skin(turning):
     landmarks, pictures, rotation = turning
     _, translation = poses(TURN)
-    tracks = track_features(pictures, landmarks, np.ones(COUNT, bool), np.zeros(COUNT, np.int32))
-    rows = tracks.observations
+    rows = followed(landmarks, pictures).observations
     begun = rows[rows[:, 0] == 0]
     assert len(begun) > 50 and np.bincount(rows[:, 1].astype(int)).min() >= 5
     seen = HEAD.template @ rotation[0].T + translation[0]
@@ -304,6 +307,6 @@ def test_absolute_pose_is_exact_with_outliers_and_pixel_centres_at_integers():
 
 def test_a_failed_adjustment_leaves_the_prior(turning, monkeypatch):
     monkeypatch.setattr("tracker.camera.adjust", lambda *_: None)
-    camera, bundle = estimate_camera(turning[0], again(turning[1]), HEAD)
+    camera, bundle = estimate_camera(turning[0], followed(*turning[:2]), HEAD)
     assert_prior(camera)
     assert len(bundle.frame) == 0  # poses that were not adjusted are no evidence
