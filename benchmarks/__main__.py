@@ -7,6 +7,11 @@ import os
 import sys
 from pathlib import Path
 
+# As the command line has it.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 
 def available() -> list[str]:
     """Names of the benchmarks in this folder: the modules that have a `main`."""

@@ -114,6 +114,16 @@ SCENES = (
     Scene(
         "long", 18, 24.0, focal=1.4, head=0.9, shot_s=10.0, skin=(0.86, 0.80, 0.76), key_light=(30.0, 30.0)
     ),
+    # A phone at arm's length: the face is 600 px wide.
+    Scene(
+        *("selfie", 19),
+        size=(1080, 1920),
+        focal=0.9,
+        face_px_per_m=4000.0,
+        speech_start_s=37.0,
+        skin=(0.95, 0.90, 0.86),
+        key_light=(-20.0, 30.0),
+    ),
 )
 
 

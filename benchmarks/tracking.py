@@ -20,7 +20,7 @@ close, false    share of the lips' closures reached within one frame; of the fit
 auc             how often a covered frame has less confidence than a clear one
 back            frames until the fit recovers from a hand or a fast turn
 lost            share of the frames with bare lips that have no fit, and so count in no error but `back`, %
-ms              processor time of landmarks, camera and all stages up to here, a frame
+ms, cpu         time of landmarks, camera and all stages up to here, a frame: on the clock, and of all processors
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from tracker.head import HeadModel, load_head
 from tracker.landmarker import track_landmarks
 from tracker.occlusion import Appearance, FaceWatch
 from tracker.refine import refine_track
-from tracker.track import F32, Bundle, Camera, Landmarks, Track
+from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
 
 PERSONS, PERSON_FRAMES = 3, 500
 COLUMNS = {
@@ -78,15 +78,17 @@ COLUMNS = {
     "back": "recovery_frames",
     "lost": "lost_pct",
     "ms": "ms",
+    "cpu": "cpu",
 }
-DECIMALS = {"r": 3, "jitter": 3, "still": 3, "focal": 1, "back": 0, "lost": 1, "ms": 0}
+TIMES = ("ms", "cpu")
+DECIMALS = {"r": 3, "jitter": 3, "still": 3, "focal": 1, "back": 0, "lost": 1, "ms": 0, "cpu": 0}
 EMPTY = np.zeros((0, 3), np.float32)
 NO_BUNDLE = Bundle(np.zeros(0, np.int32), EMPTY, EMPTY, EMPTY, np.zeros((0, 4), np.float32))
 
 
 @dataclass(frozen=True)
 class Clip:
-    """What the fit works on. appearance, video: None without pictures. spent: processor time up to here, ms a frame."""
+    """What the fit works on. appearance, video: None without pictures. spent: [2] up to here, see `clock`."""
 
     landmarks: Landmarks
     camera: Camera
@@ -95,25 +97,30 @@ class Clip:
     segment: NDArray[np.int32]
     appearance: Appearance | None
     video: Path | None
-    spent: float
+    spent: F64
 
 
-def stages(clip: Clip, head: HeadModel) -> Iterator[tuple[str, Track, float]]:
-    """The track after each stage, its name, and the processor time spent on the whole way there, ms a frame."""
+def clock() -> F64:
+    """[2] ms: the time on the wall, and that of all processors."""
+    return 1e3 * np.array([time.perf_counter(), time.process_time()])
+
+
+def stages(clip: Clip, head: HeadModel) -> Iterator[tuple[str, Track, dict[str, float]]]:
+    """The track after each stage, its name, and the time spent on the whole way there, ms a frame."""
     landmarks, camera, count = clip.landmarks, clip.camera, len(clip.usable)
     evidence = None if clip.appearance is None else bare(clip.appearance)
-    start = time.process_time()
+    start = clock()
     track = fit_track(landmarks, camera, head, clip.usable, clip.segment, evidence=evidence)
-    spent = clip.spent + 1e3 * (time.process_time() - start) / count
-    yield "landmarks", judged(track, clip), spent
+    spent = clip.spent + (clock() - start) / count
+    yield "landmarks", judged(track, clip), dict(zip(TIMES, spent))
     if (video := clip.video) is not None:
-        start = time.process_time()
+        start = clock()
         refined = refine_track(
             *(track, landmarks, camera, clip.bundle, head, clip.segment, lambda: read_frames(video)),
             evidence=evidence,
         )
-        spent += 1e3 * (time.process_time() - start) / count
-        yield "refined", judged(refined.track, clip, refined.deviation), spent
+        spent += (clock() - start) / count
+        yield "refined", judged(refined.track, clip, refined.deviation), dict(zip(TIMES, spent))
 
 
 def judged(track: Track, clip: Clip, deviation: F32 | None = None) -> Track:
@@ -125,13 +132,13 @@ def watched(video: Path, head: HeadModel) -> Clip:
     """Landmarks and camera of a film, as the pipeline finds them; `spent` leaves out the search for usable frames."""
     frames, _ = find_usable(probe(video))
     cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
-    start = time.process_time()
+    start = clock()
     watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment)
     watchers = (watch, follower)
     landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box, watchers=watchers)
     appearance = watch.appearance(frames.usable)
     camera, bundle = estimate_camera(landmarks, follower.tracks(), head)
-    spent = 1e3 * (time.process_time() - start) / len(frames.time)
+    spent = (clock() - start) / len(frames.time)
     return Clip(landmarks, camera, bundle, frames.usable, frames.segment, appearance, video, spent)
 
 
@@ -140,7 +147,7 @@ def only_landmarks(landmarks: Landmarks, focal: float) -> Clip:
     count, size = len(landmarks.time), landmarks.size
     camera = Camera(focal, 0.0, ((size[0] - 1) / 2, (size[1] - 1) / 2), (), size, "given", "")
     everywhere, one_shot = np.ones(count, bool), np.zeros(count, np.int32)
-    return Clip(landmarks, camera, NO_BUNDLE, everywhere, one_shot, None, None, 0.0)
+    return Clip(landmarks, camera, NO_BUNDLE, everywhere, one_shot, None, None, np.zeros(2))
 
 
 def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str, Clip, GroundTruth]]:
@@ -222,14 +229,14 @@ def main() -> None:
         )
         for group, name, clip, truth in ground_truths(head, chosen):
             for stage, track, spent in stages(clip, head):
-                errors = compare(track, head, truth) | {"ms": spent}
+                errors = compare(track, head, truth) | spent
                 rows.append(Row(group, name, stage, errors))
                 cells = (cell(column, errors.get(key, np.nan)) for column, key in COLUMNS.items())
                 print(f"{name:16s} {stage:10s}", *cells, sep="", flush=True)
     for video in videos:
         clip = watched(video, head)
         for stage, track, spent in stages(clip, head):
-            figures = consistency(track, clip.landmarks) | {"ms": spent}
+            figures = consistency(track, clip.landmarks) | spent
             print(f"{video.stem} {stage}", *(f"{k} {v:.3f}" for k, v in figures.items()), flush=True)
     if rows:
         print_bars(rows)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
@@ -18,6 +21,8 @@ U8 = NDArray[np.uint8]
 # A damaged picture spoils those predicted from it: up to the next key frame, or this long.
 DAMAGE_S = 5.0
 _UNSPECIFIED_COLOUR, _BT709 = 2, 1  # FFmpeg's numbers of colour spaces
+AHEAD = 2  # pictures that are decoded while one is used
+Item = TypeVar("Item")
 
 
 class FrameReader(Iterator[tuple[float, U8]]):
@@ -37,12 +42,14 @@ class FrameReader(Iterator[tuple[float, U8]]):
         self._reformatter = (
             VideoReformatter()
         )  # one for all pictures: making its tables takes longer than its work
-        self._pictures = self._read()
+        self._pictures = _ahead(self._read())
 
     def __next__(self) -> tuple[float, U8]:
-        return next(self._pictures)
+        time, picture, self.damaged = next(self._pictures)
+        return time, picture
 
-    def _read(self) -> Iterator[tuple[float, U8]]:
+    def _read(self) -> Generator[tuple[float, U8, bool]]:
+        """Time, picture, and whether it is damaged."""
         start, step = self.info.video_start_s, 1 / self.info.fps if self.info.fps else 0.04
         last, damage_end = -1.0, -1.0
         matrix, size = np.eye(2, dtype=np.int64), (0, 0)
@@ -60,9 +67,8 @@ class FrameReader(Iterator[tuple[float, U8]]):
                     damage_end = time + DAMAGE_S
                 elif frame.key_frame:
                     damage_end = -1.0
-                self.damaged = time <= damage_end
                 last = time
-                yield time, _turned(self._to_rgb(frame, size), matrix)
+                yield time, _turned(self._to_rgb(frame, size), matrix), time <= damage_end
 
     def _size(self, width: int, height: int) -> tuple[int, int]:
         scale = min(1.0, self._max_side / max(width, height)) if self._max_side else 1.0
@@ -88,9 +94,24 @@ def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:
     return FrameReader(path, max_side)
 
 
+def _ahead(items: Generator[Item]) -> Iterator[Item]:
+    """The same items, of which the next are made by a thread while one is used."""
+    end: Any = object()
+    with ThreadPoolExecutor(1) as thread:
+        try:
+            coming = deque(thread.submit(next, items, end) for _ in range(AHEAD))
+            while (item := coming.popleft().result()) is not end:
+                coming.append(thread.submit(next, items, end))
+                yield item
+        finally:
+            thread.submit(items.close)
+
+
 def _turned(picture: U8, matrix: NDArray[np.int64]) -> U8:
-    """The picture after `display_matrix`."""
+    """The picture after `display_matrix`. By OpenCV, which turns it in a third of the time that NumPy takes."""
     (xx, xy), (yx, yy) = matrix
     if xx == 0:  # what was y as stored becomes x
-        picture, xx, yy = picture.swapaxes(0, 1), yx, xy
-    return np.ascontiguousarray(picture[:: int(yy), :: int(xx)])
+        picture, xx, yy = cv2.transpose(picture), yx, xy
+    if xx > 0 and yy > 0:
+        return picture
+    return cv2.flip(picture, -1 if xx < 0 and yy < 0 else int(xx < 0))

@@ -109,7 +109,7 @@ def crop(rgb: NDArray[np.uint8], roi: Roi) -> NDArray[np.uint8]:
 def _shrunk(rgb: NDArray[np.uint8], roi: Roi, block: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """The picture around `roi`, blocks of block x block pixels averaged, and that part's corner (x, y) px."""
     size = np.array([rgb.shape[1], rgb.shape[0]])
-    reach = roi.side * np.sqrt(0.5) + block
+    reach = roi.side * (abs(np.cos(roi.angle)) + abs(np.sin(roi.angle))) / 2 + block
     low = np.clip(np.floor(np.array([roi.x, roi.y]) - reach), 0, size - block).astype(np.int64)
     blocks = np.clip((2 * reach) // block, 1, (size - low) // block).astype(np.int64)
     (left, top), (right, bottom) = low, low + blocks * block

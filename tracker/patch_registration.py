@@ -94,13 +94,15 @@ def register(texture: F32, guess: F64, bend: F64, templates: Templates) -> tuple
 def _cut(texture, xy, values, gradients):  # type: ignore[no-untyped-def]
     """Fills values and gradients of `Templates`."""
     half = np.float32(0.5)
+    ahead, behind = np.empty(len(_GRID), np.float32), np.empty(len(_GRID), np.float32)
     for n in range(len(xy)):
-        places = _GRID + xy[n]
-        values[n], strength = _levelled(_sampled(texture, places))
+        _sample(texture, _GRID, xy[n], values[n])
+        strength = _level(values[n])
         for axis in range(2):
             step = half * np.eye(2, dtype=np.float32)[axis]
-            change = _sampled(texture, places + step) - _sampled(texture, places - step)
-            gradients[n, :, axis] = change / strength
+            _sample(texture, _GRID, xy[n] + step, ahead)
+            _sample(texture, _GRID, xy[n] - step, behind)
+            gradients[n, :, axis] = (ahead - behind) / strength
 
 
 @njit(cache=True)
@@ -109,38 +111,54 @@ def _search(texture, values, gain, bend, places, correlation):  # type: ignore[n
 
     gain: [n, 2, K], the shift by the difference of a template from its patch.
     """
+    seen = np.empty(values.shape[1], np.float32)
     for n in range(len(places)):
         around, start = _GRID @ np.ascontiguousarray(bend[n].T), places[n].copy()
         for _ in range(ITERATIONS):
-            step = gain[n] @ (values[n] - _levelled(_sampled(texture, around + places[n]))[0])
-            length = np.hypot(step[0], step[1])
-            places[n] += bend[n] @ (step * np.float32(min(1.0, LONGEST_STEP / max(length, 1e-9))))
+            _sample(texture, around, places[n], seen)
+            _level(seen)
+            across, down = np.float32(0), np.float32(0)
+            for k in range(len(seen)):
+                gap = values[n, k] - seen[k]
+                across += gain[n, 0, k] * gap
+                down += gain[n, 1, k] * gap
+            length = np.hypot(across, down)
+            short = np.float32(min(1.0, LONGEST_STEP / max(length, 1e-9)))
+            places[n] += bend[n] @ (np.array([across, down]) * short)
             near = np.hypot(places[n, 0] - start[0], places[n, 1] - start[1]) < MAX_SHIFT
             if length < SETTLED or not near:
                 break
         if near and length < 5 * SETTLED:
-            seen = _levelled(_sampled(texture, around + places[n]))[0]
+            _sample(texture, around, places[n], seen)
+            _level(seen)
             correlation[n] = (seen * values[n] * _WEIGHT).sum()
 
 
 @njit(cache=True)
-def _sampled(texture, xy):  # type: ignore[no-untyped-def]
-    """[K] bilinear at xy [K, 2] px, the border repeated."""
+def _sample(texture, around, place, patch):  # type: ignore[no-untyped-def]
+    """Fills patch [K], bilinear at around [K, 2] + place [2] px, the border repeated."""
     height, width = texture.shape
-    out = np.empty(len(xy), np.float32)
-    for k in range(len(xy)):
-        x, y = min(max(xy[k, 0], 0), width - 1), min(max(xy[k, 1], 0), height - 1)
+    first, right, bottom = np.float32(0), np.float32(width - 1), np.float32(height - 1)
+    for k in range(len(patch)):
+        x = min(max(around[k, 0] + place[0], first), right)
+        y = min(max(around[k, 1] + place[1], first), bottom)
         i, j = min(int(x), width - 2), min(int(y), height - 2)
-        u, v = np.float32(x - i), np.float32(y - j)
+        u, v = x - np.float32(i), y - np.float32(j)
         top = texture[j, i] + (texture[j, i + 1] - texture[j, i]) * u
-        bottom = texture[j + 1, i] + (texture[j + 1, i + 1] - texture[j + 1, i]) * u
-        out[k] = top + (bottom - top) * v
-    return out
+        low = texture[j + 1, i] + (texture[j + 1, i + 1] - texture[j + 1, i]) * u
+        patch[k] = top + (low - top) * v
 
 
 @njit(cache=True)
-def _levelled(patch):  # type: ignore[no-untyped-def]
-    """A patch [K] at mean 0 and variance 1, and its standard deviation."""
-    centred = patch - (patch * _WEIGHT).sum()
-    strength = np.sqrt((centred * centred * _WEIGHT).sum()) + np.float32(1e-4)
-    return centred / strength, strength
+def _level(patch):  # type: ignore[no-untyped-def]
+    """Brings a patch [K] to mean 0 and variance 1; returns its standard deviation."""
+    mean, square = np.float32(0), np.float32(0)
+    for k in range(len(patch)):
+        mean += patch[k] * _WEIGHT[k]
+    for k in range(len(patch)):
+        patch[k] -= mean
+        square += patch[k] * patch[k] * _WEIGHT[k]
+    strength = np.sqrt(square) + np.float32(1e-4)
+    for k in range(len(patch)):
+        patch[k] /= strength
+    return strength
