@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -97,14 +98,11 @@ def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:
 def _ahead(items: Generator[Item]) -> Iterator[Item]:
     """The same items, of which the next are made by a thread while one is used."""
     end: Any = object()
-    with ThreadPoolExecutor(1) as thread:
-        try:
-            coming = deque(thread.submit(next, items, end) for _ in range(AHEAD))
-            while (item := coming.popleft().result()) is not end:
-                coming.append(thread.submit(next, items, end))
-                yield item
-        finally:
-            thread.submit(items.close)
+    with closing(items), ThreadPoolExecutor(1) as thread:
+        coming = deque(thread.submit(next, items, end) for _ in range(AHEAD))
+        while (item := coming.popleft().result()) is not end:
+            coming.append(thread.submit(next, items, end))
+            yield item
 
 
 def _turned(picture: U8, matrix: NDArray[np.int64]) -> U8:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import threading
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 
 from personalize.container import probe
 from personalize.errors import UserError
-from personalize.pictures import read_frames
+from personalize.pictures import _turned, read_frames
 from personalize.sound import on_video_clock, read_audio, write_wav
 from personalize.video_writer import VideoWriter
 from tests.personalize.video_factory import RATE, clicks, corner_picture, moving, write_video
@@ -42,6 +44,31 @@ def test_rotation_metadata_is_applied(tmp_path: Path, rotation: int) -> None:
     assert (info.width, info.height) == (96, 64)
     _, picture = next(read_frames(path))
     assert np.abs(picture.astype(int) - upright)[4:-4, 4:-4].mean() < 8
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("signs", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
+def test_every_quarter_turn_and_mirror(swapped: bool, signs: tuple[int, int]) -> None:
+    """Each pixel (x, y) goes to (x, y) @ matrix, counted from the left top of what comes out."""
+    stored = np.random.default_rng(0).integers(0, 255, (5, 7, 3), dtype=np.uint8)
+    matrix = np.diag(signs)[::-1] if swapped else np.diag(signs)
+    y, x = np.mgrid[:5, :7].reshape(2, -1)
+    place = np.column_stack([x, y]) @ matrix
+    place -= place.min(0)
+    expected = np.zeros((*place.max(0)[::-1] + 1, 3), np.uint8)
+    expected[place[:, 1], place[:, 0]] = stored[y, x]
+    np.testing.assert_array_equal(_turned(stored, matrix), expected)
+
+
+def test_a_reader_that_is_left_early_leaves_no_thread_behind(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mp4", moving(25), STEADY)
+    before = threading.active_count()
+    reader = read_frames(path)
+    assert next(reader)[0] == 0 and threading.active_count() == before + 1
+    del reader
+    gc.collect()
+    assert threading.active_count() == before
+    assert len(list(read_frames(path))) == 25 and threading.active_count() == before
 
 
 def test_pixels_that_are_not_square_are_made_so(tmp_path: Path) -> None:
