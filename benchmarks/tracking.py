@@ -133,7 +133,7 @@ def watched(video: Path, head: HeadModel) -> Clip:
     frames, _ = find_usable(probe(video))
     cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
     start = clock()
-    watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment)
+    watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment, frames.box)
     watchers = (watch, follower)
     landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box, watchers=watchers)
     appearance = watch.appearance(frames.usable)

@@ -74,7 +74,7 @@ class LandmarkStage(Stage):
 
     def make(self, context: Context, folder: Path) -> None:
         frames = files.read_frames(context.run.path / "ingest/frames.npz")
-        watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment)
+        watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment, frames.box)
         landmarks = track_landmarks(
             read_frames(context.run.video),
             len(frames.time),

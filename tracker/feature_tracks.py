@@ -113,9 +113,15 @@ class FeatureFollower:
     again after it was hidden. Places are in px of the shrunk picture.
     """
 
-    def __init__(self, time: F64, usable: NDArray[np.bool_], segments: NDArray[np.int32]) -> None:
-        """time: [T] s. usable: [T]. segments: [T], number of the uninterrupted shot."""
+    def __init__(
+        self, time: F64, usable: NDArray[np.bool_], segments: NDArray[np.int32], boxes: F32 | None = None
+    ) -> None:
+        """time: [T] s. usable: [T]. segments: [T], number of the uninterrupted shot.
+
+        boxes: [T, 4] px, left, top, right, bottom of the face, NaN where it is not seen: they tell its usual size.
+        """
         self._time, self._usable, self._segments = time, usable, segments
+        self._size = np.ones(len(time)) if boxes is None else (boxes[:, 2:] - boxes[:, :2]).max(1)
         self._step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
         self._seen = 0
         self._scale = np.nan
@@ -135,9 +141,7 @@ class FeatureFollower:
         if not self._due(index) or not np.isfinite(points).all():
             return
         if not self._frames:
-            # The depth between them counts as well: at the first sight the head may be turned.
-            eyes = float(np.linalg.norm(points[LEFT_EYE_OUTER] - points[RIGHT_EYE_OUTER]))
-            self._scale = float(np.clip(round(GRID * EYE_DISTANCE / max(eyes, 1.0)), 1, GRID)) / GRID
+            self._scale = self._shrinking(index, points)
         face = ((points[:, :2] + 0.5) * self._scale - 0.5).astype(np.float32)
         numbers, xy = self._followed(_part(rgb, face, self._scale), face)
         self._frames.append(index)
@@ -148,6 +152,13 @@ class FeatureFollower:
         """What was followed through the pictures seen, where it is long enough to tell anything."""
         observations = _long_tracks(np.concatenate(self._observations))
         return FeatureTracks(np.array(self._frames, np.int32), observations)
+
+    def _shrinking(self, frame: int, points: F32) -> float:
+        """By how much pictures are shrunk, from the landmarks of one frame."""
+        # The depth between the eyes counts as well: at the first sight the head may be turned, or near.
+        eyes = float(np.linalg.norm(points[LEFT_EYE_OUTER] - points[RIGHT_EYE_OUTER]))
+        usual = eyes * float(np.nanmedian(self._size[self._usable]) / self._size[frame])
+        return float(np.clip(round(GRID * EYE_DISTANCE / max(usual, 1.0)), 1, GRID)) / GRID
 
     def _due(self, frame: int) -> bool:
         """Whether to follow into a frame, if it shows a face: the first of each shot, then about every SPACING_S."""

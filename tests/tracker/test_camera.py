@@ -335,3 +335,15 @@ def test_a_part_of_a_picture_is_like_that_of_the_whole_one_shrunk(
     assert np.count_nonzero(part.mask) == np.count_nonzero(mask) > 0
     shown = part.mask > 0
     np.testing.assert_allclose(part.texture[shown], whole[y : y + height, x : x + width][shown], atol=0.02)
+
+
+def test_a_face_that_is_near_at_first_is_followed_at_its_usual_size() -> None:
+    """Somebody who starts the camera and then sits down: the face shrinks from 400 px between the eyes to 200."""
+    near = np.column_stack([2.5 * _face(), np.zeros(POINTS)]).astype(np.float32)
+    sizes = np.where(np.arange(30) < 5, 1000.0, 500.0)
+    boxes = np.column_stack([np.zeros((30, 2)), sizes, sizes]).astype(np.float32)
+    given = np.arange(30) / 8, np.ones(30, bool), np.zeros(30, np.int32)
+    for known, scale in ((boxes, 160 / 200), (None, 160 / 400)):
+        follower = FeatureFollower(*given, known)
+        follower.see(np.zeros((1000, 1400, 3), np.uint8), near)
+        assert abs(follower._scale - scale) <= 1 / 32
