@@ -114,7 +114,7 @@ SCENES = (
     Scene(
         "long", 18, 24.0, focal=1.4, head=0.9, shot_s=10.0, skin=(0.86, 0.80, 0.76), key_light=(30.0, 30.0)
     ),
-    # A phone at arm's length: the face is 600 px wide.
+    # A phone at arm's length: the face is 560 px wide.
     Scene(
         *("selfie", 19),
         size=(1080, 1920),

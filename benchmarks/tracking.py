@@ -167,7 +167,8 @@ def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str,
 
 def compile_ahead(head: HeadModel) -> None:
     """Have everything compiled that is compiled when it is first called, so that no clip's time holds it."""
-    shortest = min(SCENES, key=lambda scene: scene.seconds)
+    # Of a mouth that never opens no colours are read.
+    shortest = min((scene for scene in SCENES if scene.speaks), key=lambda scene: scene.seconds)
     for _ in stages(watched(film(shortest, head)[0], head), head):
         pass
 
