@@ -106,6 +106,7 @@ class CameraStage(Stage):
             run_head(context.settings),
             focal_given=context.settings.focal_px,
             distortion=context.settings.distortion,
+            progress=context.report.progress,
         )
         files.write_camera(folder, camera, bundle)
 

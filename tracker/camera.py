@@ -8,6 +8,7 @@ the rest.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -43,6 +44,7 @@ def estimate_camera(
     head: HeadModel,
     focal_given: float | None = None,
     distortion: tuple[float, ...] = (),
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Camera, Bundle]:
     """The camera of one clip and the rigid evidence for it, in the frame of the mean head.
 
@@ -61,7 +63,8 @@ def estimate_camera(
         found = adjust(start, surface, prior.principal_px, prior.focal_px, 0.0)
     if found is None:
         return camera, _bundle(start.select(np.zeros(0, np.int64)))
-    return camera, _bundle(_resected(_settled(found[0], surface), tracks, kept, landmarks, camera))
+    settled = _settled(found[0], surface)
+    return camera, _bundle(_resected(settled, tracks, kept, landmarks, camera, progress))
 
 
 def _telling(points: NDArray[np.floating]) -> NDArray[np.int64]:
@@ -169,7 +172,12 @@ def _pruned(scene: RigidScene) -> tuple[RigidScene, NDArray[np.int64]]:
 
 
 def _resected(
-    scene: RigidScene, tracks: FeatureTracks, kept: NDArray[np.int64], landmarks: Landmarks, camera: Camera
+    scene: RigidScene,
+    tracks: FeatureTracks,
+    kept: NDArray[np.int64],
+    landmarks: Landmarks,
+    camera: Camera,
+    progress: Callable[[int, int], None] | None,
 ) -> RigidScene:
     """The scene with the frames that were followed but not adjusted, each where its points put it.
 
@@ -179,7 +187,10 @@ def _resected(
     frames, poses, seen = [], [], []
     known = tracks.observations[np.isin(tracks.observations[:, 1], kept)].astype(np.float64)
     known[:, 1] = np.searchsorted(kept, known[:, 1])
-    for frame in np.setdiff1d(tracks.frames, scene.frames).tolist():
+    left_over = np.setdiff1d(tracks.frames, scene.frames).tolist()
+    for count, frame in enumerate(left_over, 1):
+        if progress is not None:
+            progress(count, len(left_over))
         first, last = np.searchsorted(known[:, 0], (frame, frame + 1))
         rows = known[first:last]
         right, left = landmarks.points[frame, [RIGHT_EYE_OUTER, LEFT_EYE_OUTER], :2]

@@ -9,7 +9,7 @@ rendered heads this takes a fifth off the jitter and an eighth off the error of 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Protocol
@@ -243,7 +243,7 @@ def track_landmarks(
     cuts: set[int] | None = None,
     boxes: F32 | None = None,
     progress: Callable[[int, int], None] | None = None,
-    watchers: Iterable[Watcher] = (),
+    watchers: Sequence[Watcher] = (),
 ) -> Landmarks:
     """Landmarks of a whole clip.
 

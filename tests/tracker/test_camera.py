@@ -31,10 +31,10 @@ def head() -> HeadModel:
     return load_head()
 
 
-def _clip(points: np.ndarray, time: np.ndarray | None = None) -> Landmarks:
+def _clip(points: np.ndarray) -> Landmarks:
     total = len(points)
     return Landmarks(
-        time=np.arange(total) / 25 if time is None else time,
+        time=np.arange(total) / 25,
         points=points.astype(np.float32),
         presence=np.ones(total, np.float32),
         blendshapes=np.zeros((total, 52), np.float32),
@@ -219,8 +219,10 @@ def test_a_long_clip_is_told_by_some_frames_and_its_turns_are_among_them(
     nose = subject.turning(marks.points)
     for farthest in (nose[:, 0].argmin(), nose[:, 0].argmax()):
         assert np.abs(telling - farthest).min() <= 1
-    camera, bundle = estimate_camera(marks, tracks, head)
+    told: list[tuple[int, int]] = []
+    camera, bundle = estimate_camera(marks, tracks, head, progress=lambda *step: told.append(step))
     assert camera.method == "bundle" and bundle.frame.tolist() == list(range(80))
+    assert told == [(count, 50) for count in range(1, 51)]  # those that were not adjusted
     between = Rotation.from_matrix(turns).inv() * Rotation.from_rotvec(bundle.rotation)
     error = np.degrees((between.mean().inv() * between).magnitude())
     assert error[telling].mean() < 0.5 and np.delete(error, telling).mean() < 0.5
