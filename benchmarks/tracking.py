@@ -20,7 +20,8 @@ close, false    share of the lips' closures reached within one frame; of the fit
 auc             how often a covered frame has less confidence than a clear one
 back            frames until the fit recovers from a hand or a fast turn
 lost            share of the frames with bare lips that have no fit, and so count in no error but `back`, %
-ms, cpu         time of landmarks, camera and all stages up to here, a frame: on the clock, and of all processors
+ms, cpu         time a frame of all stages up to here, from the search for usable frames on: on the clock,
+                and of all processors
 """
 
 from __future__ import annotations
@@ -129,10 +130,10 @@ def judged(track: Track, clip: Clip, deviation: F32 | None = None) -> Track:
 
 
 def watched(video: Path, head: HeadModel) -> Clip:
-    """Landmarks and camera of a film, as the pipeline finds them; `spent` leaves out the search for usable frames."""
+    """Usable frames, landmarks and camera of a film, as the pipeline finds them."""
+    start = clock()
     frames, _ = find_usable(probe(video))
     cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
-    start = clock()
     watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment, frames.box)
     watchers = (watch, follower)
     landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box, watchers=watchers)

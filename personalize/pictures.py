@@ -84,6 +84,7 @@ class FrameReader(Iterator[tuple[float, U8]]):
             width=size[0],
             height=size[1],
             format="rgb24",
+            threads=1,
             interpolation="AREA" if frame.width > size[0] else "BICUBIC",
             src_colorspace=_BT709 if hd else None,
         )

@@ -12,7 +12,7 @@ from numba import njit
 BLOCK = 256  # points whose movements and rows stay in the cache together
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def fill_rows(turned, slope, rotation, swing, moves, rows):  # type: ignore[no-untyped-def]
     """Fills rows [n, P, R, K+6] with the derivatives of R measures of each of P points by the unknowns.
 
@@ -34,7 +34,7 @@ def fill_rows(turned, slope, rotation, swing, moves, rows):  # type: ignore[no-u
                 )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def add_squares(turned, slope, rotation, swing, moves, weight, residual, square):  # type: ignore[no-untyped-def]
     """Adds rows^T rows to square [n, K+7, K+7], where rows [P, K+7] are derivatives and residual, weighted.
 
@@ -56,7 +56,7 @@ def add_squares(turned, slope, rotation, swing, moves, weight, residual, square)
             square[n] += np.dot(used.T, used)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fill(turned, slope, factor, rotation, swing, moves, p, row):  # type: ignore[no-untyped-def]
     """The derivatives at point p, times `factor`."""
     shapes = moves.shape[2]

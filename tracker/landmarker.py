@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Protocol
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracker.face_detector import Face, FaceDetector
+from tracker.halving import halved
 from tracker.landmark_indices import (
     BLENDSHAPE_INPUT,
     BLENDSHAPE_NAMES,
@@ -93,9 +95,11 @@ def crop(rgb: NDArray[np.uint8], roi: Roi) -> NDArray[np.uint8]:
     linear = to_picture[:, :2] / INPUT_SIZE
     offset = to_picture[:, 2] + linear @ (0.5, 0.5)
     # Reading single pixels of a far larger region would alias: average whole blocks first.
-    block = int(roi.side / INPUT_SIZE)
-    if block > 1:
-        rgb, corner = _shrunk(rgb, roi, block)
+    times = int(np.log2(max(roi.side / INPUT_SIZE, 1)))
+    if times:
+        block = 2**times
+        corner, part = _around(rgb, roi, block)
+        rgb = halved(part, times)
         linear, offset = linear / block, (offset - corner + 0.5) / block - 0.5
     return cv2.warpAffine(
         rgb,
@@ -106,15 +110,14 @@ def crop(rgb: NDArray[np.uint8], roi: Roi) -> NDArray[np.uint8]:
     )
 
 
-def _shrunk(rgb: NDArray[np.uint8], roi: Roi, block: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """The picture around `roi`, blocks of block x block pixels averaged, and that part's corner (x, y) px."""
+def _around(rgb: NDArray[np.uint8], roi: Roi, block: int) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Corner (x, y) px, and part of rgb [H, W, 3] around `roi`: whole blocks of block x block pixels."""
     size = np.array([rgb.shape[1], rgb.shape[0]])
     reach = roi.side * (abs(np.cos(roi.angle)) + abs(np.sin(roi.angle))) / 2 + block
     low = np.clip(np.floor(np.array([roi.x, roi.y]) - reach), 0, size - block).astype(np.int64)
     blocks = np.clip((2 * reach) // block, 1, (size - low) // block).astype(np.int64)
     (left, top), (right, bottom) = low, low + blocks * block
-    part = rgb[top:bottom, left:right]
-    return cv2.resize(part, tuple(map(int, blocks)), interpolation=cv2.INTER_AREA), low
+    return low, rgb[top:bottom, left:right]
 
 
 class FaceLandmarker:
@@ -127,7 +130,8 @@ class FaceLandmarker:
             self._detector = FaceDetector(archive.read("face_detector.tflite"), threads)
             landmarks = archive.read("face_landmarks_detector.tflite")
             blendshapes = archive.read("face_blendshapes.tflite")
-        self._landmarks = _Network(landmarks, threads)
+        self._landmarks, self._mirrored = (_Network(landmarks, threads) for _ in range(2))
+        self._beside = ThreadPoolExecutor(1)  # for the mirror image, on another processor where there is one
         self._blendshapes = _Network(blendshapes, threads)
 
     def detect(self, rgb: NDArray[np.uint8], tiled: bool = False) -> list[Face]:
@@ -141,8 +145,9 @@ class FaceLandmarker:
         in the order of BLENDSHAPE_NAMES, 0..1. They are meaningless when presence is low.
         """
         picture = crop(rgb, roi).astype(np.float32) / 255.0
-        unit, logit = self._read(picture)
-        mirrored, mirrored_logit = self._read(np.ascontiguousarray(picture[:, ::-1]))
+        reading = self._beside.submit(_read, self._mirrored, np.ascontiguousarray(picture[:, ::-1]))
+        unit, logit = _read(self._landmarks, picture)
+        mirrored, mirrored_logit = reading.result()
         mirrored = mirrored[MIRRORED]
         mirrored[:, 0] = 1 - mirrored[:, 0]
         unit = (unit + mirrored) / 2
@@ -152,12 +157,6 @@ class FaceLandmarker:
         (scores,) = self._blendshapes(points[None, BLENDSHAPE_INPUT, :2])
         presence = 1.0 / (1.0 + np.exp(-(logit + mirrored_logit) / 2))
         return points, float(presence), scores.reshape(52)
-
-    def _read(self, picture: F32) -> tuple[F32, float]:
-        """Points [478, 3] in units of the crop's width and the logit of presence, from one crop in 0..1."""
-        # The third output is a flag for a tongue that is out, which the 52 scores do without.
-        points, presence, _ = self._landmarks(picture[None])
-        return points.reshape(POINTS, 3) / np.float32(INPUT_SIZE), float(presence.reshape(()))
 
 
 class _Network:
@@ -173,6 +172,13 @@ class _Network:
         self._interpreter.set_tensor(self._input, values)
         self._interpreter.invoke()
         return [self._interpreter.get_tensor(i) for i in self._outputs]
+
+
+def _read(network: _Network, picture: F32) -> tuple[F32, float]:
+    """Points [478, 3] in units of the crop's width and the logit of presence, from one crop in 0..1."""
+    # The third output is a flag for a tongue that is out, which the 52 scores do without.
+    points, presence, _ = network(picture[None])
+    return points.reshape(POINTS, 3) / np.float32(INPUT_SIZE), float(presence.reshape(()))
 
 
 class LandmarkTracker:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,10 @@ GIVE_UP = 1e6  # damping at which no step can help
 LEAST_STEP = 0.05  # of STEP_S: nearer frames are taken to be so far apart
 PART, SHARED = 4000, 100  # frames of a long clip that are solved at once, and how many more on both sides
 CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
+THREADS = 2  # that do so; they let go of the interpreter for most of the time
+
+
+Result = TypeVar("Result")
 
 
 class FrameEnergy(Protocol):
@@ -167,7 +172,7 @@ def schur_step(
     solved = np.linalg.solve(block, np.concatenate([cross.transpose(0, 2, 1), gradient[..., None]], axis=2))
     shared = quadratic.hessian[:, :k, :k].sum(0) + prior * np.eye(k)
     shared[np.arange(k), np.arange(k)] *= 1 + damping
-    shared -= np.einsum("nkp,npj->kj", cross, solved[..., :k])
+    shared -= (cross @ solved[..., :k]).sum(0)
     right = np.einsum("nkp,np->k", cross, solved[..., k]) - shifted[:, :k].sum(0) - prior * identity
     step_identity = np.linalg.solve(shared, right)
     return step_identity, move - solved[..., k] - solved[..., :k] @ step_identity
@@ -301,7 +306,7 @@ def _solve_part(
     progress: Progress,
 ) -> F64:
     def total(x: F64) -> float:
-        parts = [energy.select(part).value(shape, x[part]).sum() for part in _chunks(len(x))]
+        parts = _in_chunks(lambda part: energy.select(part).value(shape, x[part]).sum(), len(x))
         return float(sum(parts)) + smoothness.value(x)
 
     bounds = _bounds(energy)
@@ -331,17 +336,22 @@ def _bounds(energy: FrameEnergy | SharedEnergy) -> Bounds:
     return Bounds(energy.model.modes.lower, energy.model.modes.upper)
 
 
-def _chunks(n: int) -> list[slice]:
-    return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
+def _in_chunks(function: Callable[[slice], Result], count: int) -> list[Result]:
+    """What the function gives for each CHUNK of `count` frames, in their order, THREADS of them at a time."""
+    chunks = [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
+    with ThreadPoolExecutor(THREADS) as threads:
+        return list(threads.map(function, chunks))
 
 
 def _linearize(energy: FrameEnergy, shape: F64, x: F64) -> tuple[float, F64, F64]:
-    value, gradient, hessian = 0.0, np.empty(x.shape), np.empty((*x.shape, x.shape[1]))
-    for part in _chunks(len(x)):
+    gradient, hessian = np.empty(x.shape), np.empty((*x.shape, x.shape[1]))
+
+    def fill(part: slice) -> float:
         quadratic = energy.select(part).linearize(shape, x[part])
-        value += float(quadratic.value.sum())
         gradient[part], hessian[part] = quadratic.gradient, quadratic.hessian
-    return value, gradient, hessian
+        return float(quadratic.value.sum())
+
+    return sum(_in_chunks(fill, len(x))), gradient, hessian
 
 
 def band_step(

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from tracker.halving import halved
 from tracker.track import F32, F64
 
 U8 = NDArray[np.uint8]
@@ -46,8 +47,9 @@ class Window:
 
     def cut(self, rgb: U8, row: int) -> U8:
         """[height, width] u8 grey; outside of the picture its border goes on."""
+        times = int(np.log2(1 / self.scale))
         low = self.origin[row].astype(int)
-        high = low + [round(side / self.scale) for side in self.size]
+        high = low + [2**times * round(side / self.scale / 2**times) for side in self.size]
         limit = np.array(rgb.shape[1::-1])
         first, last = np.clip(low, 0, limit - 1), np.clip(high, 1, limit)
         last = np.maximum(last, first + 1)
@@ -55,7 +57,7 @@ class Window:
         if (missing := np.concatenate([first - low, high - last])).any():
             left, top, right, bottom = np.maximum(missing, 0)
             grey = cv2.copyMakeBorder(grey, top, bottom, left, right, cv2.BORDER_REPLICATE)
-        return cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA)
+        return cv2.resize(halved(grey, times), self.size, interpolation=cv2.INTER_AREA)
 
     def principal(self, principal: F64, row: int | slice) -> F64:
         """[2] px, the principal point in one cut picture, or [.., 2] in several."""
@@ -94,7 +96,7 @@ class View:
         return value, slope
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _bilinear(picture, points, focal, centre, value, slope):  # type: ignore[no-untyped-def]
     """Outside of the picture the value is that of its border, the slope zero."""
     height, width = picture.shape

@@ -10,6 +10,7 @@ from tests.tracker.test_flame import arrays, surface
 from tracker.appearance import HARMONICS, appearance, frame_light, harmonics, shaded, skin_of
 from tracker.energy import POSE, Energy, Weights, landmark_model
 from tracker.flame import flame_head
+from tracker.halving import halved
 from tracker.head import load_head
 from tracker.modes import LIP_SHAPES
 from tracker.photometric import PhotometricEnergy
@@ -107,6 +108,29 @@ def test_window_cuts_what_lies_outside_as_its_border():
     assert inside.shape == (8, 10)
     assert (inside[:, :8] == 200).all() and (inside[:, 8:] == 0).all()
     assert Window(np.array([[500.0, -90.0]]), 0.5, (10, 8)).cut(rgb, 0).shape == (8, 10)
+
+
+@pytest.mark.parametrize("scale", [0.7, 0.5, 0.36, 0.23])
+def test_a_cut_picture_shows_what_its_window_says_however_much_it_is_shrunk(scale: float):
+    across, down = np.meshgrid(np.arange(700), np.arange(900))
+    rgb = np.stack([0.2 * across + 0.1 * down] * 3, axis=-1).round().astype(np.uint8)
+    window = Window(np.array([[31.0, 42.0]]), scale, (130, 150))
+    places = [(np.arange(side) + 0.5) / scale - 0.5 for side in window.size]
+    wanted = 0.2 * (places[0] + 31)[None, :] + 0.1 * (places[1] + 42)[:, None]
+    error = window.cut(rgb, 0) - wanted
+    # Half a pixel of the cut picture is what whole pixels of the other leave open, and halves of grey levels.
+    assert np.abs(error).max() < 0.5 * 0.3 / scale + 0.7
+    assert abs(error.mean()) < 0.25 * 0.3 / scale
+
+
+def test_halved_pictures_are_means_of_blocks():
+    rng = np.random.default_rng(3)
+    picture = rng.uniform(0, 255, (43, 66, 3)).astype(np.float32)
+    for times in range(4):
+        block = 2**times
+        height, width = 43 // block, 66 // block
+        blocks = picture[: height * block, : width * block].reshape(height, block, width, block, 3)
+        np.testing.assert_allclose(halved(picture, times), blocks.mean((1, 3)), rtol=1e-5)
 
 
 def test_light_and_albedo_explain_what_they_made():
