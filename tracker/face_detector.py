@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tracker.halving import halved
 from tracker.networks import open_network
 from tracker.track import F32
 
@@ -83,6 +84,8 @@ def merge(points: F32, scores: F32) -> list[tuple[F32, float]]:
 
 def letterbox(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float, tuple[int, int]]:
     """The picture [H, W, 3] inside a black INPUT_SIZE square: (square, scale, (left, top) border in px)."""
+    times = int(np.log2(max(*rgb.shape[:2], INPUT_SIZE) / INPUT_SIZE))
+    rgb = halved(rgb, times)
     height, width = rgb.shape[:2]
     scale = INPUT_SIZE / max(height, width)
     inner = max(1, round(width * scale)), max(1, round(height * scale))
@@ -90,7 +93,7 @@ def letterbox(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float, tuple[i
     left, top = (INPUT_SIZE - inner[0]) // 2, (INPUT_SIZE - inner[1]) // 2
     square = np.zeros((INPUT_SIZE, INPUT_SIZE, 3), np.uint8)
     square[top : top + inner[1], left : left + inner[0]] = small
-    return square, scale, (left, top)
+    return square, scale / 2**times, (left, top)
 
 
 def tiles(width: int, height: int, divisor: int) -> Iterator[tuple[int, int, int]]:

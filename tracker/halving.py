@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 
 def halved(picture: NDArray[Any], times: int) -> NDArray[Any]:
-    """[H, W, ..] -> [H // 2^times, W // 2^times, ..]: means of blocks; rows and columns left over are cut off."""
+    """[H, W, ..] -> [H // 2^times, W // 2^times, ..], means of blocks; rows and columns left over are cut off.
+
+    One row and one column are left of any picture.
+    """
     for _ in range(times):
-        height, width = (side // 2 for side in picture.shape[:2])
+        height, width = (max(side // 2, 1) for side in picture.shape[:2])
         picture = cv2.resize(
             picture[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA
         )

@@ -131,6 +131,7 @@ def test_halved_pictures_are_means_of_blocks():
         height, width = 43 // block, 66 // block
         blocks = picture[: height * block, : width * block].reshape(height, block, width, block, 3)
         np.testing.assert_allclose(halved(picture, times), blocks.mean((1, 3)), rtol=1e-5)
+    assert halved(picture[:3], 3).shape == (1, 8, 3)
 
 
 def test_light_and_albedo_explain_what_they_made():
