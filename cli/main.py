@@ -14,6 +14,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Training takes two threads. They must sleep while they wait: spinning costs 100 times the time on a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+# What takes long to import is imported by the command that needs it: help comes at once, and an interruption in those
+# seconds finds `main` there to tell of it.
 import typer
 
 from cli.animate import animate
@@ -22,7 +24,6 @@ from cli.edit import edit
 from cli.run import run
 from cli.train import train
 from personalize.errors import UserError
-from personalize.run import tool_version
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "run": run,
@@ -47,6 +48,8 @@ for name, command in COMMANDS.items():
 
 def _print_version(value: bool) -> None:
     if value:
+        from personalize.run import tool_version
+
         typer.echo(f"personalize {tool_version()}")
         raise typer.Exit()
 

@@ -58,7 +58,7 @@ def personalize_video(
     force: str | None = None,
     report: Reporter | None = None,
 ) -> dict[str, Path]:
-    """Bring the run folder of `video` up to date; returns its products by name.
+    """Bring the run folder of `video` up to date; returns the products that are, by name.
 
     out: the run folder, by default the video's name + `.personalize` in the working folder.
     Raises UserError for whatever the user can mend.
@@ -86,9 +86,8 @@ def personalize_video(
         report.log_to(folder / "log.txt")
         run.begin(settings)
         try:
-            run_stages(stages, Context(run, settings, report), first=first, until=until, force=force)
+            done = run_stages(stages, Context(run, settings, report), first=first, until=until, force=force)
         except (TrackError, ModelError) as error:
             raise UserError(f"{video}: {error}") from error
-    return {"run": folder} | {
-        Path(name).stem: folder / name for name in PRODUCTS if (folder / name).is_file()
-    }
+    made = {name for stage in done for name in stage.products}
+    return {"run": folder} | {Path(name).stem: folder / name for name in PRODUCTS if name in made}

@@ -66,6 +66,10 @@ class Stage(ABC):
     def make(self, context: Context, folder: Path) -> None:
         """Write every file of `makes` and `products` into `folder`."""
 
+    def warnings(self, run: RunFolder) -> Sequence[str]:
+        """What the user should act on, of a result that is already there."""
+        return ()
+
     def key(self, context: Context) -> str:
         """Content hash of all that decides this stage's result."""
         run = context.run
@@ -106,6 +110,8 @@ def run_stage(stage: Stage, context: Context, *, force: bool = False) -> bool:
     key = stage.key(context)
     if not force and is_cached(stage, key, run):
         report.cached(stage.name)
+        for text in stage.warnings(run):
+            report.warn(text)
         return False
     started = time.monotonic()
     with report.stage(stage.name):
@@ -123,18 +129,18 @@ def run_stages(
     first: str | None = None,
     until: str | None = None,
     force: str | None = None,
-) -> None:
+) -> Sequence[Stage]:
     """Run stages in order. `first` remakes that stage and all after it, `force` that one; `until` stops after it.
 
-    Raises UserError for a stage name that does not exist.
+    Returns those that are up to date now. Raises UserError for a stage name that does not exist.
     """
     check_names(stages, first, until, force)
     names = [stage.name for stage in stages]
     from_index = names.index(first) if first else len(stages)
-    for index, stage in enumerate(stages):
+    wanted = stages[: names.index(until) + 1] if until else stages
+    for index, stage in enumerate(wanted):
         run_stage(stage, context, force=index >= from_index or stage.name == force)
-        if stage.name == until:
-            break
+    return wanted
 
 
 def check_names(stages: Sequence[Stage], first: str | None, until: str | None, force: str | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from personalize.overlay import write_overlay
 from personalize.pictures import read_frames
 from personalize.quality import frame_reasons, write_quality
 from personalize.registration import register_run
+from personalize.run import RunFolder
 from personalize.settings import Settings
 from personalize.sound import write_wav
 from personalize.stage import VIDEO, Context, Stage
@@ -61,6 +63,10 @@ class Ingest(Stage):
         files.write_frames(folder / "frames.npz", ingested.frames)
         write_wav(folder / "audio.wav", ingested.audio)
         write_json(folder / "split.json", ingested.split)
+
+    def warnings(self, run: RunFolder) -> Sequence[str]:
+        texts: list[str] = run.read_json("ingest/media.json")["warnings"]
+        return texts
 
 
 class LandmarkStage(Stage):

@@ -33,6 +33,15 @@ def test_version_and_help(tmp_path: Path) -> None:
     assert "--iterations" in personalize("run", "--help", cwd=tmp_path).stdout
 
 
+def test_the_command_is_there_before_what_takes_seconds_to_import(tmp_path: Path) -> None:
+    """So that help comes at once and an interruption meets no traceback."""
+    script = (
+        "import sys, cli.main; print([name for name in ('torch', 'numba', 'cv2') if name in sys.modules])"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert shown.stdout.strip() == "[]", shown.stderr
+
+
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [

@@ -18,6 +18,7 @@ from personalize.reporter import Reporter
 from personalize.run import RunFolder
 from personalize.settings import Settings
 from personalize.stage import Context, Stage, is_cached, run_stages
+from personalize.stages import Ingest
 
 
 class Count(Stage):
@@ -99,15 +100,31 @@ def test_a_damaged_output_is_made_again(context: Context, damaged: str) -> None:
 
 
 def test_until_from_and_force(context: Context) -> None:
-    run_stages(STAGES, context, until="count")
+    assert list(run_stages(STAGES, context, until="count")) == [STAGES[0]]
     assert (Count.made, Double.made) == (1, 0)
-    run_stages(STAGES, context)
+    assert list(run_stages(STAGES, context)) == list(STAGES)
     run_stages(STAGES, context, force="count")
     assert (Count.made, Double.made) == (2, 1), "the same bytes came out: what follows stays"
     run_stages(STAGES, context, first="count")
     assert (Count.made, Double.made) == (3, 2)
     with pytest.raises(UserError, match="no such stage; choose one of count, double"):
         run_stages(STAGES, context, until="counts")
+
+
+def test_a_cached_stage_says_again_what_it_warned_of(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Count, "warnings", lambda self, run: ["the face is dark"])
+    run_stages(STAGES, context)
+    assert context.report.warnings == [], "what is made warns itself"
+    run_stages(STAGES, context)
+    assert context.report.warnings == ["the face is dark"]
+
+
+def test_ingest_remembers_its_warnings(context: Context) -> None:
+    (context.run.path / "ingest").mkdir()
+    (context.run.path / "ingest/media.json").write_text(json.dumps({"warnings": ["the face is dark"]}))
+    assert Ingest().warnings(context.run) == ["the face is dark"]
 
 
 def test_a_failing_stage_leaves_the_earlier_result(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
