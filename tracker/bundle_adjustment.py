@@ -299,7 +299,8 @@ class _Problem:
     ) -> tuple[F64, _Points]:
         """What observations tell of poses, log(focal) and shape, points solved for.
 
-        Their normal matrix, in which the slope is one more row and column: [6M + 1 + R + 1, 6M + 1 + R + 1].
+        Their normal matrix, in which the slope is one more column: [6M + 1 + R + 1, 6M + 1 + R + 1]. Of the block
+        left of focal's and shape's rows, which mirrors the one above, nothing is to be read.
         """
         residual, pose, point, focal = linear.residual, linear.pose, linear.point, linear.focal
         modes = self._surface.modes

@@ -3,7 +3,8 @@
 Pixel centres are at integers throughout. The network's own coordinates put them at halves (a mirror test
 shows a shift of half a crop pixel); sampling the crop at its pixels' centres and reading the output in units
 of the crop's width, edge to edge, leaves none. Every crop is also read mirrored and the two are averaged: on
-rendered heads this takes a fifth off the jitter and an eighth off the error of the lips, for 6 ms a frame.
+rendered heads this takes a fifth off the jitter and an eighth off the error of the lips, for 6 ms a frame of a
+second processor.
 """
 
 from __future__ import annotations

@@ -22,7 +22,6 @@ PART, SHARED = 4000, 100  # frames of a long clip that are solved at once, and h
 CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
 THREADS = 2  # that do so; they let go of the interpreter for most of the time
 
-
 Result = TypeVar("Result")
 
 
