@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,14 +15,17 @@ from personalize.errors import UserError
 from personalize.people import FaceFollower, Tracklet, main_person
 from personalize.pictures import read_frames
 from personalize.shots import (
+    F32,
+    F64,
     MAX_GAP_S,
     MIN_SHOT_S,
     REASONS,
-    THUMBNAIL,
+    Bool,
     Frames,
     difference,
     find_shots,
     repeated,
+    thumbnail,
     usable_seconds,
 )
 from personalize.sound import on_video_clock, read_audio
@@ -66,7 +68,7 @@ class Ingested:
 
     media: MediaInfo
     frames: Frames
-    audio: NDArray[np.float32]
+    audio: F32
     split: dict[str, Any]
     warnings: list[str]
 
@@ -91,7 +93,7 @@ def ingest_video(path: Path | str, progress: Progress = None) -> Ingested:
     return Ingested(media, frames, on_video_clock(*audio, end), make_split(frames), warnings)
 
 
-def _read_sound(media: MediaInfo) -> tuple[NDArray[np.float32], float]:
+def _read_sound(media: MediaInfo) -> tuple[F32, float]:
     if not media.has_audio:
         raise UserError(
             f"{media.path}: there is no sound in this file; give a video with the person's speech"
@@ -103,11 +105,14 @@ def _read_sound(media: MediaInfo) -> tuple[NDArray[np.float32], float]:
 
 
 def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, list[str]]:
-    """Frames of a video with their reasons, and warnings. Two passes: shots first, then faces."""
-    time, change, again, corrupt = _look_for_cuts(media, progress)
+    """Frames of a video with their reasons, and warnings.
+
+    In one pass: a cut is told by the pictures behind it too, so what was followed across one is divided afterwards.
+    """
+    time, change, again, corrupt, faces = _looked_through(media, progress)
     _check_rate(media, time[~again])
     segment = find_shots(time, change)
-    mine, others = main_person(_follow_faces(media, segment, progress))
+    mine, others = main_person([shot for face in faces for shot in face.shots(segment)])
     _check_upright(media, mine)
     total = len(time)
     reason = np.full(total, REASONS.index("no_face"), np.uint8)
@@ -137,7 +142,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     return frames, _lost_in_file(media, time) + _warnings(frames, eyes, light, burnt)
 
 
-def _check_rate(media: MediaInfo, changed: NDArray[np.float64]) -> None:
+def _check_rate(media: MediaInfo, changed: F64) -> None:
     """Raise UserError when the picture changes, at the times `changed` [n] s, too rarely to learn speech from it."""
     if len(changed) < 2:
         return  # it stands still, which is another complaint
@@ -160,46 +165,37 @@ def _check_upright(media: MediaInfo, person: list[Tracklet]) -> None:
             )
 
 
-def _look_for_cuts(
-    media: MediaInfo, progress: Progress
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """First pass: times [T] s, how much each picture differs from the last [T], repeated [T], damaged [T]."""
-    reader = read_frames(media.path, THUMBNAIL)
+def _looked_through(media: MediaInfo, progress: Progress) -> tuple[F64, F64, Bool, Bool, list[Tracklet]]:
+    """Times [T] s, how much each picture differs from the last [T], repeated [T], damaged [T]; every face.
+
+    Faces are in pixels of a picture of at most SEARCH_SIDE.
+    """
+    reader, follower = read_frames(media.path, SEARCH_SIDE), FaceFollower(FaceLandmarker())
     expected = max(1, round(media.duration_s * media.fps))
     rows = []
-    last: NDArray[np.uint8] | None = None
-    for time, rgb in reader:
-        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    last: F32 | None = None
+    for index, (time, rgb) in enumerate(reader):
+        grey = thumbnail(rgb)
         change, equal = difference(grey, last) if last is not None else (0.0, False)
         rows.append((time, change, equal, reader.damaged))
         last = grey
+        follower.add(index, time, rgb)
         if progress is not None:
-            progress(min(len(rows), expected), 2 * expected)
+            progress(min(len(rows), expected), expected)
     times, changes, same, damaged = zip(*rows)
     at, differences = np.array(times), np.array(changes)
-    return at, differences, repeated(at, differences, np.array(same)), np.array(damaged)
+    again = repeated(at, differences, np.array(same))
+    return at, differences, again, np.array(damaged), follower.tracklets
 
 
-def _follow_faces(media: MediaInfo, segment: NDArray[np.int32], progress: Progress) -> list[Tracklet]:
-    """Second pass: every face, in pixels of a picture of at most SEARCH_SIDE."""
-    follower = FaceFollower(FaceLandmarker())
-    total = len(segment)
-    for index, (time, rgb) in enumerate(read_frames(media.path, SEARCH_SIDE)):
-        follower.add(index, time, int(segment[index]), rgb)
-        if progress is not None:
-            progress(total + index + 1, 2 * total)
-    return follower.tracklets
-
-
-def _filled(tracklet: Tracklet, time: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[n, 8] box, eyes, light, burnt and sharpness of each frame from a tracklet's first to its last.
+def _filled(tracklet: Tracklet, time: F64) -> F64:
+    """[n, 8] measures of each frame from a tracklet's first to its last.
 
     Frames that the detector missed are interpolated; NaN where it missed too many.
     """
     index = np.array(tracklet.frames)
     span = time[index[0] : index[-1] + 1]
-    seen = tracklet.eyes, tracklet.light, tracklet.burnt, tracklet.sharpness
-    known = np.column_stack([np.stack(tracklet.boxes), *seen])
+    known = np.array([sighting.measures for sighting in tracklet.sightings])
     rows = np.column_stack([np.interp(span, time[index], column) for column in known.T])
     after = np.searchsorted(time[index], span)
     gap = time[index][after] - time[index][np.maximum(after - 1, 0)]
@@ -207,14 +203,14 @@ def _filled(tracklet: Tracklet, time: NDArray[np.float64]) -> NDArray[np.float64
     return rows
 
 
-def _cut(time: NDArray[np.float64], segment: NDArray[np.int32]) -> NDArray[np.bool_]:
+def _cut(time: F64, segment: NDArray[np.int32]) -> Bool:
     """[T] first frames after a cut, and shots too short to track."""
     first = np.diff(segment, prepend=segment[0]) != 0
     length = np.array([np.ptp(time[segment == s]) for s in range(segment[-1] + 1)])
     return first | (length[segment] < MIN_SHOT_S)
 
 
-def _lost_in_file(media: MediaInfo, time: NDArray[np.float64]) -> list[str]:
+def _lost_in_file(media: MediaInfo, time: F64) -> list[str]:
     """What the file holds no pictures of: gaps, and an end that comes early."""
     texts = []
     gaps = np.flatnonzero(np.diff(time) > MAX_GAP_S)
@@ -226,9 +222,7 @@ def _lost_in_file(media: MediaInfo, time: NDArray[np.float64]) -> list[str]:
     return texts
 
 
-def _warnings(
-    frames: Frames, eyes: NDArray[np.float32], light: NDArray[np.float32], burnt: NDArray[np.float32]
-) -> list[str]:
+def _warnings(frames: Frames, eyes: F32, light: F32, burnt: F32) -> list[str]:
     """What the person should know of a clip that is used all the same."""
     texts = []
     total = len(frames.time)

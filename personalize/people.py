@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import groupby
 
 import cv2
 import numpy as np
@@ -20,7 +21,9 @@ MIDDLE = np.s_[PATCH // 4 :, PATCH // 5 : -PATCH // 5]  # of it: no background, 
 BRIGHTEST = 250  # a colour value that the camera may have cut off
 MIN_OVERLAP = 0.3  # intersection over union of a face's boxes from one picture to the next
 MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
-SAMPLE_S = 0.6  # time between two looks at the face's shape
+SAMPLE_S = (
+    0.4  # time between two looks at the face's shape: less than any shot that is tracked, so each has one
+)
 MIN_PRESENCE = 0.5  # of the landmarker: what it does not take for a face is none, whatever the detector says
 SEARCH_S = 1.0  # between searches for small faces in tiles while none is seen
 PORTRAIT = (12, 14)  # px, width and height of the grey picture that people are told apart by
@@ -30,35 +33,66 @@ SHAPE_SCALE, PORTRAIT_SCALE, OTHER_PERSON = 0.05, 0.25, 2.0
 SEEDS = 5  # largest tracklets tried as the main person
 
 
-@dataclass(eq=False)
-class Tracklet:
-    """One face followed through one shot. The lists hold an entry a frame, but for `shapes`.
+@dataclass(frozen=True)
+class Sighting:
+    """One face in one picture.
 
-    frames: indices. times: s. boxes: [4] px. eyes: px between the eyes. light: mean grey level of the face. burnt:
-    share of its colour values that cannot be brighter. sharpness: see `sharpness`. shapes: landmarks [478, 3] px, and
-    portraits: PORTRAIT, of a frame every SAMPLE_S.
+    frame: index. time: s. box: [4] px. eyes: px between the eyes. light: mean grey level of the face. burnt: share of
+    its colour values that cannot be brighter. sharpness: see `sharpness`. sample: every SAMPLE_S the landmarks
+    [478, 3] px and a PORTRAIT, unless the landmarker takes it for no face.
     """
 
-    segment: int
-    frames: list[int] = field(default_factory=list)
-    times: list[float] = field(default_factory=list)
-    boxes: list[F32] = field(default_factory=list)
-    eyes: list[float] = field(default_factory=list)
-    light: list[float] = field(default_factory=list)
-    burnt: list[float] = field(default_factory=list)
-    sharpness: list[float] = field(default_factory=list)
-    shapes: list[F32] = field(default_factory=list)
-    portraits: list[U8] = field(default_factory=list)
+    frame: int
+    time: float
+    box: F32
+    eyes: float
+    light: float
+    burnt: float
+    sharpness: float
+    sample: tuple[F32, U8] | None = None
+
+    @property
+    def measures(self) -> list[float]:
+        """[8]: box, eyes, light, burnt, sharpness."""
+        return [*self.box, self.eyes, self.light, self.burnt, self.sharpness]
+
+
+@dataclass(eq=False)
+class Tracklet:
+    """One face followed from picture to picture."""
+
+    sightings: list[Sighting]
     next_sample: float = -1.0
+
+    @property
+    def frames(self) -> list[int]:
+        """Indices."""
+        return [sighting.frame for sighting in self.sightings]
+
+    @property
+    def shapes(self) -> list[F32]:
+        """The landmarks of its samples."""
+        return [sighting.sample[0] for sighting in self.sightings if sighting.sample]
+
+    @property
+    def portraits(self) -> list[U8]:
+        """Those of its samples."""
+        return [sighting.sample[1] for sighting in self.sightings if sighting.sample]
 
     @property
     def weight(self) -> float:
         """How much the face is in the picture: its frames times its width."""
-        return float(sum(box[2] - box[0] for box in self.boxes))
+        return float(sum(sighting.box[2] - sighting.box[0] for sighting in self.sightings))
+
+    def shots(self, segment: NDArray[np.int32]) -> list[Tracklet]:
+        """Its parts in each uninterrupted shot, whose number is segment [T]: behind a cut it may be somebody else."""
+        return [
+            Tracklet(list(part)) for _, part in groupby(self.sightings, lambda seen: int(segment[seen.frame]))
+        ]
 
 
 class FaceFollower:
-    """Finds every face in every picture and joins those of one shot that overlap."""
+    """Finds every face in every picture and joins those that overlap, be there a cut between them or not."""
 
     def __init__(self, landmarker: FaceLandmarker) -> None:
         self._landmarker = landmarker
@@ -66,33 +100,36 @@ class FaceFollower:
         self._next_search = -1.0
         self.tracklets: list[Tracklet] = []
 
-    def add(self, index: int, time: float, segment: int, rgb: U8) -> None:
+    def add(self, index: int, time: float, rgb: U8) -> None:
         """Look at the next picture [H, W, 3]."""
-        self._open = [t for t in self._open if t.segment == segment and time - t.times[-1] <= MAX_LOST_S]
+        self._open = [t for t in self._open if time - t.sightings[-1].time <= MAX_LOST_S]
         waiting = list(self._open)
         for face in self._find(time, rgb):
-            tracklet = max(waiting, key=lambda t: _overlap(t.boxes[-1], face.box), default=None)
-            if tracklet is None or _overlap(tracklet.boxes[-1], face.box) < MIN_OVERLAP:
-                tracklet = Tracklet(segment)
+            tracklet = max(waiting, key=lambda t: _overlap(t.sightings[-1].box, face.box), default=None)
+            if tracklet is None or _overlap(tracklet.sightings[-1].box, face.box) < MIN_OVERLAP:
+                tracklet = Tracklet([])
                 self.tracklets.append(tracklet)
                 self._open.append(tracklet)
             else:
                 waiting.remove(tracklet)
-            tracklet.frames.append(index)
-            tracklet.times.append(time)
-            tracklet.boxes.append(face.box)
-            tracklet.eyes.append(float(np.linalg.norm(face.keypoints[0] - face.keypoints[1])))
             patch = _face_patch(rgb, face.box)
             grey = cv2.cvtColor(patch, cv2.COLOR_RGB2GRAY)
-            tracklet.light.append(float(grey.mean()))
-            tracklet.burnt.append(float((patch[MIDDLE] >= BRIGHTEST).mean()))
-            tracklet.sharpness.append(sharpness(grey))
-            self._sample(tracklet, time, face, rgb)
+            sighting = Sighting(
+                index,
+                time,
+                face.box,
+                eyes=float(np.linalg.norm(face.keypoints[0] - face.keypoints[1])),
+                light=float(grey.mean()),
+                burnt=float((patch[MIDDLE] >= BRIGHTEST).mean()),
+                sharpness=sharpness(grey),
+                sample=self._sample(tracklet, time, face, rgb),
+            )
+            tracklet.sightings.append(sighting)
 
     def _find(self, time: float, rgb: U8) -> list[Face]:
         faces = self._landmarker.detect(rgb)
         if not faces:
-            faces = [face for t in self._open for face in self._find_near(t.boxes[-1], rgb)]
+            faces = [face for t in self._open for face in self._find_near(t.sightings[-1].box, rgb)]
         if not faces and time >= self._next_search:
             self._next_search = time + SEARCH_S
             faces = self._landmarker.detect(rgb, tiled=True)
@@ -107,14 +144,12 @@ class FaceFollower:
         offset = np.array([left, top], np.float32)
         return [Face(f.box + np.tile(offset, 2), f.keypoints + offset, f.score) for f in found]
 
-    def _sample(self, tracklet: Tracklet, time: float, face: Face, rgb: U8) -> None:
+    def _sample(self, tracklet: Tracklet, time: float, face: Face, rgb: U8) -> tuple[F32, U8] | None:
         if time < tracklet.next_sample:
-            return
+            return None
         tracklet.next_sample = time + SAMPLE_S
         points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
-        if presence >= MIN_PRESENCE:
-            tracklet.shapes.append(points)
-            tracklet.portraits.append(_portrait(rgb, points))
+        return (points, _portrait(rgb, points)) if presence >= MIN_PRESENCE else None
 
 
 def _face_patch(rgb: U8, box: F32) -> U8:

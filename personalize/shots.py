@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +20,7 @@ REASONS = (
     "corrupt",
     "duplicate",
 )
-THUMBNAIL = 64  # px, width of the grey pictures in which cuts and duplicates are looked for
+THUMBNAIL = 64  # px, long side of the grey pictures in which cuts and duplicates are looked for
 MAX_GAP_S = 0.25  # a longer time between two pictures ends a shot: nothing is known of what moved there
 MIN_SHOT_S = 0.5  # shorter shots are left out: too little to track
 # A cut changes the picture by so much (grey levels, mean) and so many times more than its neighbours in time.
@@ -55,9 +56,20 @@ class Frames:
     box: F32
 
 
-def difference(grey: U8, last: U8) -> tuple[float, bool]:
+def thumbnail(rgb: U8) -> F32:
+    """A picture [H, W, 3] as a grey one, 0 to 255, whose long side is THUMBNAIL px.
+
+    Not rounded to whole levels, by which the pictures of a dim film would be the same.
+    """
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    scale = THUMBNAIL / max(grey.shape)
+    size = [max(1, round(side * scale)) for side in grey.shape[::-1]]
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def difference(grey: F32, last: F32) -> tuple[float, bool]:
     """How a grey picture [h, w] differs from the one before: (mean grey levels, whether it is the same)."""
-    change = np.abs(grey.astype(np.int16) - last)
+    change = np.abs(grey - last)
     return float(change.mean()), bool(change.max() <= SAME_LEVEL)
 
 

@@ -12,8 +12,17 @@ import pytest
 from personalize.container import probe
 from personalize.errors import UserError
 from personalize.ingest import MIN_USABLE_S, find_usable, ingest_video
-from personalize.people import FaceFollower, Tracklet, main_person
-from personalize.shots import REASONS, Frames, difference, find_shots, repeated, usable_seconds
+from personalize.people import FaceFollower, Sighting, Tracklet, main_person
+from personalize.shots import (
+    MIN_SHOT_S,
+    REASONS,
+    Frames,
+    difference,
+    find_shots,
+    repeated,
+    thumbnail,
+    usable_seconds,
+)
 from personalize.split import make_split
 from tests.personalize.video_factory import RATE, clicks, moving, write_video
 from tracker.face_detector import Face
@@ -126,16 +135,21 @@ def test_split_moves_to_a_cut_nearby() -> None:
     assert split["val"][0][0] == pytest.approx(20.8, abs=0.05)
 
 
-def tracklet(person: int, frames: range, width: float = 50, seed: int = 0) -> Tracklet:
+def tracklet(
+    person: int, frames: range, width: float = 50, seed: int = 0, light: float = 120.0, burnt: float = 0.0
+) -> Tracklet:
     """A face whose shape and portrait are those of `person`, with some noise and in another pose."""
     own, noise = np.random.default_rng(person), np.random.default_rng(seed + 1000)
     shape = np.random.default_rng(99).normal(size=(478, 3)) + 0.15 * own.normal(size=(478, 3))
     portrait = own.integers(0, 255, (14, 12))
-    t = Tracklet(0, list(frames), [f / 25 for f in frames])
-    t.boxes = [np.array([0, 0, width, width], np.float32)] * len(t.frames)
-    t.shapes = [(100 * (shape + 0.01 * noise.normal(size=shape.shape)) + 7).astype(np.float32)] * 2
-    t.portraits = [(0.7 * portrait + noise.integers(0, 20, portrait.shape)).astype(np.uint8)] * 2
-    return t
+    sample = (
+        (100 * (shape + 0.01 * noise.normal(size=shape.shape)) + 7).astype(np.float32),
+        (0.7 * portrait + noise.integers(0, 20, portrait.shape)).astype(np.uint8),
+    )
+    box = np.array([0, 0, width, width], np.float32)
+    return Tracklet(
+        [Sighting(f, f / 25, box, 60.0, light, burnt, 0.5, None if f % 10 else sample) for f in frames]
+    )
 
 
 def test_the_person_most_in_the_picture_is_kept_over_cuts() -> None:
@@ -152,8 +166,8 @@ def test_one_of_two_people_seen_together_is_kept() -> None:
 
 
 def test_what_the_landmarker_never_took_for_a_face_is_nobody() -> None:
-    ghost = tracklet(1, range(0, 50))
-    ghost.shapes, ghost.portraits = [], []
+    ghost = tracklet(1, range(1, 10))
+    assert not ghost.shapes
     assert main_person([ghost]) == ([], [])
 
 
@@ -185,11 +199,10 @@ def test_a_face_that_lies_on_its_side_is_refused(
 ) -> None:
     path = write_video(tmp_path / "clip.mkv", moving(20), [i / 25 for i in range(20)])
     face = tracklet(1, range(20))
-    face.eyes, face.light, face.burnt, face.sharpness = [60.0] * 20, [120.0] * 20, [0.0] * 20, [0.5] * 20
     angle = np.radians(tilt_deg)
     for shape in face.shapes:
         shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + 60 * np.array([np.cos(angle), np.sin(angle)])
-    monkeypatch.setattr("personalize.ingest._follow_faces", lambda *_: [face])
+    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: Mock(tracklets=[face]))
     if refused:
         with pytest.raises(UserError, match="on its side"):
             find_usable(probe(path))
@@ -211,11 +224,10 @@ def test_too_much_light_is_told_as_too_little_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, light: float, burnt: float, reason: str, said: str
 ) -> None:
     path = write_video(tmp_path / "clip.mkv", moving(20), [i / 25 for i in range(20)])
-    face = tracklet(1, range(20))
-    face.eyes, face.light, face.burnt, face.sharpness = [60.0] * 20, [light] * 20, [burnt] * 20, [0.5] * 20
+    face = tracklet(1, range(20), light=light, burnt=burnt)
     for shape in face.shapes:
         shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [60, 0]
-    monkeypatch.setattr("personalize.ingest._follow_faces", lambda *_: [face])
+    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: Mock(tracklets=[face]))
     frames, warnings = find_usable(probe(path))
     assert {frames.reasons[index] for index in frames.reason[1:]} == {reason}
     assert (said in " ".join(warnings)) if said else not any("face is" in text for text in warnings)
@@ -228,27 +240,48 @@ def test_how_much_of_a_face_is_cut_off_is_measured() -> None:
     face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
     landmarker = Mock(detect=lambda rgb: [face], landmarks=lambda *_: (np.zeros((478, 3)), 0.0, None))
     follower = FaceFollower(landmarker)
-    follower.add(0, 0.0, 0, picture)
-    assert follower.tracklets[0].burnt == pytest.approx([1 / 3], abs=0.02)
+    follower.add(0, 0.0, picture)
+    assert follower.tracklets[0].sightings[0].burnt == pytest.approx(1 / 3, abs=0.02)
+
+
+@pytest.mark.parametrize("fps", [12, 25, 60])
+def test_a_face_followed_across_cuts_is_looked_at_in_every_shot(fps: int) -> None:
+    face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
+    points = np.random.default_rng(0).normal(200, 40, (478, 3)).astype(np.float32)
+    landmarker = Mock(detect=lambda rgb: [face], landmarks=lambda *_: (points, 0.9, None))
+    follower, picture = FaceFollower(landmarker), np.full((480, 640, 3), 90, np.uint8)
+    time = np.arange(6 * fps) / fps
+    for index, moment in enumerate(time):
+        follower.add(index, float(moment), picture)
+    segment = np.unique((time / (1.05 * MIN_SHOT_S)).astype(np.int32), return_inverse=True)[1]
+    (followed,) = follower.tracklets
+    shots = followed.shots(segment.astype(np.int32))
+    assert [shot.frames for shot in shots] == [
+        np.flatnonzero(segment == s).tolist() for s in np.unique(segment)
+    ]
+    assert all(shot.shapes for shot in shots if len(shot.frames) > MIN_SHOT_S * fps)
+
+
+def test_what_moves_in_the_dark_is_no_repeated_picture() -> None:
+    dark = np.full((480, 640, 3), 11, np.uint8)
+    moved = dark.copy()
+    moved[200:206, 300:310] = 13  # one of ten by ten pixels by 1.2 levels, which rounding would make 1
+    assert not difference(thumbnail(moved), thumbnail(dark))[1]
+    assert difference(thumbnail(dark), thumbnail(dark))[1]
 
 
 @pytest.mark.parametrize(
     ("fps", "repeats", "said"), [(4, 1, "4.0"), (6, 1, "6.0"), (25, 5, "5.0"), (8, 1, ""), (25, 2, "")]
 )
-def test_too_few_pictures_a_second_are_refused_before_faces_are_looked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fps: int, repeats: int, said: str
-) -> None:
+def test_too_few_pictures_a_second_are_refused(tmp_path: Path, fps: int, repeats: int, said: str) -> None:
     pictures = [picture for picture in moving(24) for _ in range(repeats)]
     path = write_video(tmp_path / "slow.mkv", pictures, [i / fps for i in range(len(pictures))])
-    looked: list[str] = []
-    monkeypatch.setattr("personalize.ingest._follow_faces", lambda media, *_: looked.append(media.path) or [])
     if said:
         with pytest.raises(UserError, match=rf"^{path}: only {said} different pictures a second") as caught:
             find_usable(probe(path))
         assert "\n" not in str(caught.value)
     else:
         find_usable(probe(path))
-    assert bool(looked) != bool(said)
 
 
 def test_a_matroska_file_that_begins_late_breaks_not_off(tmp_path: Path) -> None:
