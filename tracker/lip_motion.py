@@ -7,12 +7,15 @@ that agree with both err by a fifth less.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from tracker.lip_lines import LOG, SAMPLES, STEP_MM
+from tracker.threads import THREADS, side_by_side
 from tracker.track import F64, STEP_S
 from tracker.view import U8
 
@@ -53,7 +56,8 @@ def steadied(edges: F64, colours: U8, run: NDArray[np.int64], time: F64) -> F64:
     for apart in links:
         linked = (run[apart:] == run[:-apart]) & (run[apart:] >= 0)
         change = np.zeros((max(count - apart, 0), widths.shape[1]))
-        _fill_changes(colours, edges, np.flatnonzero(linked), apart, change)
+        parts = np.array_split(np.flatnonzero(linked), THREADS)
+        list(side_by_side(partial(_fill_changes, colours, edges, apart, change), parts))
         change *= STRETCH
         told = widths[apart:] - widths[:-apart]
         fast = np.maximum(np.abs(told), np.abs(change))
@@ -69,8 +73,8 @@ def steadied(edges: F64, colours: U8, run: NDArray[np.int64], time: F64) -> F64:
     return np.maximum(np.stack([solveh_banded(normal[:, :, q], right[:, q]) for q in lines], axis=1), 0.0)
 
 
-@njit(cache=True, fastmath=True)
-def _fill_changes(colours, edges, rows, apart, change):  # type: ignore[no-untyped-def]
+@njit(cache=True, fastmath=True, nogil=True)
+def _fill_changes(colours, edges, apart, change, rows):  # type: ignore[no-untyped-def]
     """Fills change [.., Q] mm, of the widths from each of the frames `rows` to the one `apart` frames later.
 
     The mean of what is found forwards and backwards. colours: [n, Q, S, 3] u8. edges: [n, Q, 2] mm.
@@ -87,7 +91,7 @@ def _fill_changes(colours, edges, rows, apart, change):  # type: ignore[no-untyp
                 change[row, line] += (there - back) / 2 if side else (back - there) / 2
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def _shift(now, then, before, after, line, side):  # type: ignore[no-untyped-def]
     """mm by which what lies beside an edge is found farther down a line.
 
@@ -112,7 +116,7 @@ def _shift(now, then, before, after, line, side):  # type: ignore[no-untyped-def
     return told + ((best + between) / FINER - REACH) * STEP_MM
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def _difference(now, then, edge, shift, side):  # type: ignore[no-untyped-def]
     """Sum of squares by which a line's colours [S, 3] beside an edge differ from those `shift` mm farther down.
 
@@ -130,7 +134,7 @@ def _difference(now, then, edge, shift, side):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def _between(line, place, channel):  # type: ignore[no-untyped-def]
     """A line's colour [S, 3] between two samples; beyond those looked at, the last one's."""
     place = min(max(place, FIRST), LAST)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from tracker.lip_lines import LOG, SAMPLES, STEP_MM
+from tracker.threads import side_by_side
 from tracker.track import F32, F64
 from tracker.view import U8, Index
 
@@ -60,7 +61,7 @@ def lip_edges(colours: U8, marks: F64, sound: Index) -> F64 | None:
     if (known := LipColours.of(taught, moved[learned])) is None:
         return None
     parts = np.array_split(np.arange(len(colours)), max(1, len(colours) // LEARNED))
-    return np.concatenate([known.edges(colours[rows], moved[rows]) for rows in parts])
+    return np.concatenate(list(side_by_side(lambda rows: known.edges(colours[rows], moved[rows]), parts)))
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def _likelihoods(bins: NDArray[np.int32], classes: NDArray[np.int8]) -> F32 | No
     return np.clip(table - table.max(0) + DOUBT, -TRUSTED, 0)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fill_edges(likelihood, light, samples, marks, edges):  # type: ignore[no-untyped-def]
     """Fills edges [n, Q, 2] mm from log likelihoods [3, n, Q, S] and light [n, Q, S] at samples [S] mm.
 
@@ -170,7 +171,7 @@ def _fill_edges(likelihood, light, samples, marks, edges):  # type: ignore[no-un
             edges[n, q] = first, last
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _expected_edges(before, start, upper, lower):  # type: ignore[no-untyped-def]
     """Mean places of the upper and the lower edge over all pairs, upper first; edge k lies at start + k steps."""
     edges = before.shape[1]
@@ -195,7 +196,7 @@ def _expected_edges(before, start, upper, lower):  # type: ignore[no-untyped-def
     return start + STEP_MM * above / total, start + STEP_MM * below / total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _lit_edge(light, samples, edge):  # type: ignore[no-untyped-def]
     """Where the light [S] rises half way from darkness to the lower lip; the edge itself if nothing is dark there.
 

@@ -124,7 +124,7 @@ def render(
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if samples > 1 else picture
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fill(vertices, faces, cull, triangle, barycentric, inverse_depth):  # type: ignore[no-untyped-def]
     height, width = triangle.shape
     for f in range(len(faces)):
@@ -160,7 +160,7 @@ def _fill(vertices, faces, cull, triangle, barycentric, inverse_depth):  # type:
                     barycentric[y, x, 2] = r / nearness
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _normals(vertices, faces):  # type: ignore[no-untyped-def]
     normals = np.zeros_like(vertices)
     for f in range(len(faces)):
@@ -179,7 +179,7 @@ def _normals(vertices, faces):  # type: ignore[no-untyped-def]
     return normals
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _spread(triangle, barycentric, faces, field, values):  # type: ignore[no-untyped-def]
     height, width = triangle.shape
     for y in range(height):
@@ -189,7 +189,7 @@ def _spread(triangle, barycentric, faces, field, values):  # type: ignore[no-unt
                     values[y, x, channel] = _value(triangle, barycentric, faces, field, y, x, channel)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _paint(triangle, barycentric, faces, reflectance, brightness, picture):  # type: ignore[no-untyped-def]
     height, width = triangle.shape
     for y in range(height):
@@ -201,7 +201,7 @@ def _paint(triangle, barycentric, faces, reflectance, brightness, picture):  # t
                     picture[y, x, channel] = np.uint8(min(255 * np.sqrt(value * light) + 0.5, 255))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _value(triangle, barycentric, faces, field, y, x, channel):  # type: ignore[no-untyped-def]
     """One channel of a vertex field on the surface that pixel (x, y) sees."""
     value = np.float32(0)

@@ -18,6 +18,7 @@ from tracker.lip_opening import lip_edges
 from tracker.rigid_pose import hold_poses
 from tracker.skin_fit import Photometry, Subject, fit_landmarks, fit_stretch, learn_levels
 from tracker.skin_identity import fit_identity_to_skin, nearer_to_skin
+from tracker.threads import side_by_side
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
 from tracker.view import U8, Index
 
@@ -101,12 +102,18 @@ def refine_track(
     levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
     deviation = np.full((len(good), 2), np.nan)
     refined = x.copy()
-    for start, part in _stretches(cuts, len(good), _overlap(time)):
+
+    def fitted(stretch: tuple[int, dict[int, U8]]) -> tuple[int, Index, F64, F64, F64]:
+        start, part = stretch
         rows = np.array(list(part))
         smoothness = smoothness_between(
             subject.energy, landmarks.time, good[rows], segment, subject.smoothness
         )
-        found, before, after = fit_stretch(subject, levels, list(part.values()), rows, x[rows], smoothness)
+        return start, rows, *fit_stretch(subject, levels, list(part.values()), rows, x[rows], smoothness)
+
+    for start, rows, found, before, after in side_by_side(
+        fitted, _stretches(cuts, len(good), _overlap(time))
+    ):
         better = np.isfinite(found).all(1) & (after[:, 0] < before[:, 0])
         own = (rows >= start) & (rows < start + STRETCH)
         refined[rows[own & better]] = found[own & better]

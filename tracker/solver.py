@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from tracker.banded import solve_banded
 from tracker.energy import POSE, LandmarkModel, Quadratic, Weights
+from tracker.threads import side_by_side
 from tracker.track import F64, STEP_S
 
 ROUNDS = 4  # of fixing what passes a bound
@@ -20,7 +20,6 @@ GIVE_UP = 1e6  # damping at which no step can help
 LEAST_STEP = 0.05  # of STEP_S: nearer frames are taken to be so far apart
 PART, SHARED = 4000, 100  # frames of a long clip that are solved at once, and how many more on both sides
 CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
-THREADS = 2  # that do so; they let go of the interpreter for most of the time
 
 Result = TypeVar("Result")
 
@@ -336,10 +335,9 @@ def _bounds(energy: FrameEnergy | SharedEnergy) -> Bounds:
 
 
 def _in_chunks(function: Callable[[slice], Result], count: int) -> list[Result]:
-    """What the function gives for each CHUNK of `count` frames, in their order, THREADS of them at a time."""
+    """What the function gives for each CHUNK of `count` frames, in their order."""
     chunks = [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
-    with ThreadPoolExecutor(THREADS) as threads:
-        return list(threads.map(function, chunks))
+    return list(side_by_side(function, chunks))
 
 
 def _linearize(energy: FrameEnergy, shape: F64, x: F64) -> tuple[float, F64, F64]:
@@ -365,17 +363,13 @@ def band_step(
     gradient, hessian = freeze(gradient, hessian, fixed)
     free = ~fixed
     diagonal, first, second = smoothness.bands(n)
-    band = np.zeros((2 * p + 1, n, p))
-    for offset in range(p):
-        index = np.arange(p - offset)
-        band[offset, :, : p - offset] = hessian[:, index + offset, index]
-    band[0] += diagonal * free
-    band[0] *= 1 + damping
-    band[0] += 1e-9
-    band[p, :-1] = (first * free)[:-1] * free[1:]
-    band[2 * p, :-2] = (second * free)[:-2] * free[2:]
-    factor = cholesky_banded(
-        band.reshape(2 * p + 1, n * p), lower=True, overwrite_ab=True, check_finite=False
-    )
-    step = cho_solve_banded((factor, True), -gradient.ravel(), check_finite=False).reshape(n, p)
+    band = np.zeros((n, p, 2 * p + 1))
+    for unknown in range(p):
+        band[:, unknown, : p - unknown] = hessian[:, unknown, unknown:]
+    band[..., 0] += diagonal * free
+    band[..., 0] *= 1 + damping
+    band[..., 0] += 1e-9
+    band[:-1, :, p] = (first * free)[:-1] * free[1:]
+    band[:-2, :, 2 * p] = (second * free)[:-2] * free[2:]
+    step = solve_banded(band.reshape(n * p, 2 * p + 1), -gradient.ravel()).reshape(n, p)
     return np.zeros(0), move + step
