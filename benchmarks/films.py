@@ -40,7 +40,6 @@ LIP = np.array([176.0, 92.0, 88.0])
 PALENESS = (0.5, 0.85)  # how far lips are from skin to the head's own red
 LIP_GLOSS = 1.8  # of the skin's
 LIP_SOFTNESS = 0.4
-HAND_COLOUR = (205.0, 165.0, 148.0)
 MADE_BY = (
     *(
         module.__file__
@@ -112,8 +111,10 @@ class _Studio:
         self._backdrop = backdrop(self._large, scene.seed)
         self._block = skin_block(scene.seed)
         self._props = [props.glasses(person)] if scene.glasses else []
+        if scene.fringe:
+            self._props.append(props.hair(person, scene.hair))
         if scene.hand:
-            self._props.append(props.hand(person))
+            self._props.append(props.hand(person, scene.skin))
         parts, first = [person.faces], len(person.template)
         for prop in self._props:
             parts.append(prop.faces + first)
@@ -121,9 +122,7 @@ class _Studio:
         self._faces = np.concatenate(parts).astype(np.int32)
         self._own = len(parts[0])
         self._inside = mouth.within(person)
-        self._albedo = np.concatenate(
-            [_painted(person, scene), *(_prop_paint(prop, scene) for prop in self._props)]
-        )
+        self._albedo = np.concatenate([_painted(person, scene), *(prop.albedo for prop in self._props)])
         self._places = np.concatenate([person.template, *(p.vertices for p in self._props)]).astype(
             np.float32
         )
@@ -205,12 +204,6 @@ def _streak(moved: F64) -> F32:
         u, v = x - j, y - i
         kernel[i : i + 2, j : j + 2] += np.outer([1 - v, v], [1 - u, u])
     return kernel / kernel.sum()
-
-
-def _prop_paint(prop: props.Prop, scene: Scene) -> F64:
-    """[V, 3] one colour; a hand has the person's skin."""
-    colour = np.array(HAND_COLOUR) * scene.skin if prop.moves else props.FRAME_COLOUR
-    return np.tile(colour, (len(prop.vertices), 1))
 
 
 def _painted(person: HeadModel, scene: Scene) -> F64:

@@ -1,4 +1,4 @@
-"""Things in front of a face: glasses and a hand, made of tubes in the head frame."""
+"""Things in front of a face: glasses, hair and a hand, made of tubes in the head frame."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
 
 from tracker.head import HeadModel
 from tracker.track import F64
@@ -15,15 +16,23 @@ ACROSS = np.array([0.0, 0.7, 0.7])  # no tube here runs along it
 HAND_S = (2.6, 0.28, 0.5)  # when the hand starts, how long it comes and goes, how long it stays
 HAND_AWAY_M = (0.1, -0.35, 0.02)
 FRAME_COLOUR = (28.0, 24.0, 26.0)  # of the glasses, sRGB
+HAND_COLOUR = (205.0, 165.0, 148.0)
+FRINGE, LOCKS = 260, 130  # strands over the forehead, and down each cheek
+STRAND_M = 0.0006
+STRAND_SHADES = 0.25  # standard deviation of a strand's brightness, as a share
 
 
 @dataclass(frozen=True)
 class Prop:
-    """A mesh in the head frame: vertices [V, 3] m, faces [F, 3]. moves: comes to the face and goes again."""
+    """A mesh in the head frame: vertices [V, 3] m, faces [F, 3], albedo [V, 3] sRGB.
+
+    moves: comes to the face and goes again.
+    """
 
     vertices: F64
     faces: NDArray[np.int32]
-    moves: bool
+    albedo: F64
+    moves: bool = False
 
     def at(self, time: float) -> F64:
         """[V, 3] m at a time, s."""
@@ -50,11 +59,13 @@ def tube(points: F64, radius: ArrayLike) -> tuple[F64, NDArray[np.int32]]:
     return vertices.reshape(-1, 3), faces.astype(np.int32)
 
 
-def _joined(tubes: list[tuple[F64, NDArray[np.int32]]], moves: bool) -> Prop:
+def _joined(tubes: list[tuple[F64, NDArray[np.int32]]], colours: ArrayLike, moves: bool = False) -> Prop:
+    """colours: [3] of all, or [N, 3] of each of the N tubes."""
     first = np.cumsum([0, *(len(vertices) for vertices, _ in tubes)])
     faces = [faces + start for (_, faces), start in zip(tubes, first)]
+    albedo = np.repeat(np.broadcast_to(colours, (len(tubes), 3)), np.diff(first), axis=0)
     vertices = np.concatenate([vertices for vertices, _ in tubes])
-    return Prop(vertices, np.concatenate(faces).astype(np.int32), moves)
+    return Prop(vertices, np.concatenate(faces).astype(np.int32), albedo.astype(np.float64), moves)
 
 
 def glasses(head: HeadModel) -> Prop:
@@ -69,11 +80,46 @@ def glasses(head: HeadModel) -> Prop:
         hinges.append(centre + np.array([side * 0.027, 0.006, 0.0]))
     temples = [tube(np.linspace(h, [1.15 * h[0], h[1], 0.0], 12), 0.0016) for h in hinges]
     bridge = np.linspace(hinges[1] + [0.054, 0, 0], hinges[0] - [0.054, 0, 0], 6)
-    return _joined([*rims, *temples, tube(bridge, 0.0016)], moves=False)
+    return _joined([*rims, *temples, tube(bridge, 0.0016)], FRAME_COLOUR)
 
 
-def hand(head: HeadModel) -> Prop:
-    """Four fingers over the mouth of a head (its template), a palm below."""
+def hair(head: HeadModel, colour: ArrayLike) -> Prop:
+    """Strands over the forehead of a head (its template) to the brows, and over the edges of both cheeks.
+
+    colour: [3], 0 to 1, sRGB.
+    """
+    random = np.random.default_rng(7)
+    skin = head.template[np.concatenate([head.regions["face"], head.regions["scalp"]])].astype(np.float64)
+    skin = skin[skin[:, 2] > 0]
+    around = KDTree(skin[:, :2])
+    eyes, lips = (head.template[head.regions[name]].mean(0) for name in ("eyes", "lips"))
+    wide = np.abs(head.template[head.regions["face"], 0]).max()
+    along = np.linspace(0, 1, 20)
+
+    def strand(x: F64, low: float) -> tuple[F64, NDArray[np.int32]]:
+        top = eyes[1] + 0.09 * np.sqrt(1 - min(np.abs(x[0]) / (1.25 * wide), 1) ** 2)
+        y = top + along * (low - top)
+        _, near = around.query(np.stack([x, y], 1), k=12)
+        z = skin[near, 2].max(1) + 0.003 + 0.003 * random.uniform()
+        smooth = np.convolve(np.pad(z, 3, mode="edge"), np.full(7, 1 / 7), "valid")
+        wave = 0.002 * np.sin(6 * along + random.uniform(0, 6))
+        return tube(np.stack([x + wave, y, smooth], 1), STRAND_M * np.append(np.ones(len(along) - 1), 0))
+
+    strands = []
+    for _ in range(FRINGE):
+        lean = random.normal(0.006, 0.004) * along**1.5
+        strands.append(
+            strand(random.uniform(-0.9, 0.9) * wide + lean, eyes[1] + random.uniform(0.010, 0.026))
+        )
+    for side in np.repeat([-1, 1], LOCKS):
+        x = side * (random.uniform(0.8, 1.0) * wide + 0.006 * np.sin(np.pi * along))
+        strands.append(strand(x, lips[1] - random.uniform(0.02, 0.06)))
+    shades = 1 + STRAND_SHADES * random.normal(size=(len(strands), 1))
+    return _joined(strands, np.clip(255 * np.asarray(colour) * shades, 0, 255))
+
+
+def hand(head: HeadModel, skin: ArrayLike) -> Prop:
+    """Four fingers over the mouth of a head (its template), a palm below. skin: [3] factors of their colour."""
     mouth = head.template[head.regions["lips"]].mean(0) + np.array([0.0, 0.0, 0.030])
     place = np.linspace(0, 1, 24)
     rounded = np.sqrt(1 - np.abs(2 * place - 1) ** 6)
@@ -85,4 +131,4 @@ def hand(head: HeadModel) -> Prop:
                 [x + 0.25 * (low + place * (high - low)), low + place * (high - low), 0 * place], 1
             )
             tubes.append(tube(mouth + points, radius * rounded))
-    return _joined(tubes, moves=True)
+    return _joined(tubes, np.array(HAND_COLOUR) * skin, moves=True)

@@ -66,6 +66,8 @@ class Scene:
     """How far the light's azimuth moves to either side."""
     ambient: float = 0.4
     gloss: float = 0.08
+    fringe: bool = False
+    """Hair to the brows, and over the edges of both cheeks."""
     glasses: bool = False
     hand: bool = False
     shutter: float = 0.35
@@ -113,6 +115,16 @@ SCENES = (
     Scene("fast_turn", 17, focal=2.4, head=0.5, fast_turn_deg=38.0, speech_start_s=31.0, shutter=0.5),
     Scene(
         "long", 18, 24.0, focal=1.4, head=0.9, shot_s=10.0, skin=(0.86, 0.80, 0.76), key_light=(30.0, 30.0)
+    ),
+    Scene(
+        *("hair", 20),
+        focal=1.35,
+        head=1.0,
+        speech_start_s=16.0,
+        skin=(1.02, 0.99, 0.96),
+        hair=(0.36, 0.25, 0.17),
+        fringe=True,
+        key_light=(25.0, 35.0),
     ),
     # A phone at arm's length: the face is 560 px wide.
     Scene(

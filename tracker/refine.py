@@ -15,7 +15,7 @@ from tracker.key_frames import key_frames
 from tracker.lip_lines import LipLines
 from tracker.lip_motion import steadied
 from tracker.lip_opening import lip_edges
-from tracker.rigid_pose import hold_poses
+from tracker.rigid_pose import hold_poses, turned_as_far
 from tracker.skin_fit import Photometry, Subject, fit_landmarks, fit_stretch, learn_levels
 from tracker.skin_identity import fit_identity_to_skin, nearer_to_skin
 from tracker.threads import side_by_side
@@ -87,6 +87,7 @@ def refine_track(
     if not len(rows):
         return Refined(track, unknown)
     run, time = runs(good, segment, landmarks.time), landmarks.time[good]
+    bundle = turned_as_far(bundle, x, good, sound, camera.focal_sd_log)
     on_bundle = hold_poses(x, bundle, good, run, time, sound)
     if rigid := nearer_to_skin(subject, held, rows, x, on_bundle):
         x = on_bundle

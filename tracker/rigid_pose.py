@@ -3,9 +3,15 @@
 Landmarks err in blocks that move with the head, so a pose fitted to them swings by a degree. The bundle's poses do
 not, but they stand in a head frame of their own and exist on every third frame or so; the difference to the
 landmarks' poses, one similarity for the clip taken out, is carried over to the frames between.
+
+A large turn of a flat face moves a point as a small one of a deep face does. Where hair, or a long lens, leaves open
+how deep the points lie, all turns of the bundle are too large or too small by one factor, which landmarks, fitted by a
+head of usual depth, tell.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +27,39 @@ Corrections = list[tuple[F64, F64]]  # times [k] s and corrections [k, 6] of a s
 MIN_FRAMES = 8  # fewer do not tell how the two head frames lie to each other
 CERTAIN = np.array([[1.0], [1.0], [0.1]])  # of a landmark pose's place: depth is seen ten times less well
 LEAST_SEEN = 0.3  # of the points that a frame of the bundle usually sees: with fewer its pose may be anything
+# Standard deviations of the logarithm of how far a head is found to turn, as 14 films have it: of the bundle, a share
+# of its focal length's; of the landmarks, whose poses err besides by so much (rad) each, some frames alike.
+BUNDLE_TURN, LANDMARK_TURN = 0.5, 0.06
+LANDMARK_POSE, ALIKE = 0.0175, 4
+MOST_TURN = 2.0  # that factor, or its inverse
 FADE_S = 0.48  # beyond the last frame known: the time over which its correction fades
+
+
+def turned_as_far(bundle: Bundle, x: F64, good: Rows, sound: Rows, focal_sd_log: float) -> Bundle:
+    """The bundle whose heads turn as far from their mean pose as it and the poses in x [n, P] tell together.
+
+    good: [n], frames of x. sound: its rows that are believed. focal_sd_log: of the bundle's focal length.
+    """
+    known = np.isin(bundle.frame, good[sound])
+    if known.sum() < MIN_FRAMES:
+        return bundle
+    rotation = Rotation.from_rotvec(bundle.rotation).as_matrix()
+    own = rotation_matrix(x[np.searchsorted(good, bundle.frame[known]), -6:-3])
+    middle = Rotation.from_matrix(rotation[known]).mean()
+    turn = (Rotation.from_matrix(rotation) * middle.inv()).as_rotvec()
+    told = (Rotation.from_matrix(own) * Rotation.from_matrix(own).mean().inv()).as_rotvec()
+    square = float((turn[known] ** 2).sum())
+    factor = np.clip((told * turn[known]).sum() / max(square, 1e-9), 1 / MOST_TURN, MOST_TURN)
+    certain = LANDMARK_TURN**2 + ALIKE * LANDMARK_POSE**2 / max(square, 1e-9)
+    factor **= 1 / (1 + certain / max((BUNDLE_TURN * focal_sd_log) ** 2, 1e-9))
+    turned = (Rotation.from_rotvec(factor * turn) * middle).as_matrix()
+    # The face turns in its place.
+    centre = bundle.points.mean(0, dtype=np.float64) if len(bundle.points) else np.zeros(3)
+    return replace(
+        bundle,
+        rotation=Rotation.from_matrix(turned).as_rotvec().astype(np.float32),
+        translation=(bundle.translation + (rotation - turned) @ centre).astype(np.float32),
+    )
 
 
 def hold_poses(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.props import glasses, hand, tube
+from benchmarks.props import glasses, hair, hand, tube
 from tracker.head import load_head
 
 
@@ -21,10 +21,10 @@ def test_tube_has_the_volume_of_a_cylinder() -> None:
 
 def test_glasses_and_hand_turn_outward_and_stand_before_the_face() -> None:
     head = load_head()
-    for prop in (glasses(head), hand(head)):
+    for prop in (glasses(head), hand(head, np.ones(3)), hair(head, np.ones(3))):
         assert volume(prop.vertices, prop.faces) > 0
     eyes = head.template[head.regions["eyes"], 2].max()
     assert 0.005 < glasses(head).vertices[:, 2].max() - eyes < 0.03
     lips = head.template[head.regions["lips"], 2].max()
-    assert hand(head).at(3.1)[:, 2].min() > lips
-    assert hand(head).at(0.0)[:, 1].max() < head.template[:, 1].min() + 0.1
+    assert hand(head, np.ones(3)).at(3.1)[:, 2].min() > lips
+    assert hand(head, np.ones(3)).at(0.0)[:, 1].max() < head.template[:, 1].min() + 0.1

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tracker.energy import rotation_matrix, rotation_vector
-from tracker.rigid_pose import FADE_S, hold_poses
+from tracker.rigid_pose import FADE_S, hold_poses, turned_as_far
 from tracker.track import Bundle
 
 FRAMES, STEP = 90, 3
@@ -122,3 +122,41 @@ def test_between_frames_corrections_go_by_the_time_and_not_by_how_many_frames_th
     some = hold_poses(start[good], bundle, good, RUN[good], TIME[good], np.arange(len(good)), 1.0)
     change = whole[good] - start[good]
     np.testing.assert_allclose(some - start[good], change, atol=0.002 * np.abs(change).max())
+
+
+def flattened(bundle: Bundle, factor: float) -> Bundle:
+    """The bundle, its turns from the mean pose all larger by a factor, as if the face were flatter than it is."""
+    rotation = Rotation.from_rotvec(bundle.rotation)
+    middle = rotation.mean()
+    turned = Rotation.from_rotvec(factor * (rotation * middle.inv()).as_rotvec()) * middle
+    points = np.random.default_rng(3).normal([0, 0, -0.09], 0.02, (50, 3)).astype(np.float32)
+    return replace(bundle, rotation=turned.as_rotvec().astype(np.float32), points=points)
+
+
+def turn_deg(bundle: Bundle) -> float:
+    rotation = Rotation.from_rotvec(bundle.rotation)
+    return float(np.degrees((rotation * rotation.mean().inv()).magnitude()).mean())
+
+
+@pytest.mark.parametrize("factor", [0.75, 1.3])
+def test_a_bundle_turns_as_far_as_landmarks_and_it_tell_together(truth: np.ndarray, factor: float) -> None:
+    exact = bundle_of(truth, GOOD[::STEP])
+    wrong, noise = flattened(exact, factor), np.random.default_rng(2).normal(0, np.radians(0.7), (FRAMES, 3))
+    start = truth + np.pad(noise, ((0, 0), (2, 3)))
+    for focal_sd_log, low, high in ((1.0, 0.9, 1.0), (0.12, 0.3, 0.6), (0.02, 0.0, 0.05)):
+        right = turned_as_far(wrong, start, GOOD, GOOD, focal_sd_log)
+        share = np.log(turn_deg(right) / turn_deg(wrong)) / np.log(turn_deg(exact) / turn_deg(wrong))
+        assert low < share < high + 0.05, "the less is known of the focal length, the more landmarks count"
+        before, after = (
+            Rotation.from_rotvec(b.rotation).apply(b.points.mean(0)) + b.translation for b in (wrong, right)
+        )
+        np.testing.assert_allclose(after, before, atol=1e-5)  # the face stays where it was seen
+
+
+def test_a_head_that_hardly_turns_or_is_hardly_known_says_nothing_of_how_far(truth: np.ndarray) -> None:
+    still = truth.copy()
+    still[:, 2:5] = still[0, 2:5]
+    for x, frames in ((still, GOOD[::STEP]), (truth, GOOD[:7])):
+        bundle = flattened(bundle_of(x, frames), 0.7)
+        told = turned_as_far(bundle, drifted(x), GOOD, GOOD, 0.2)
+        np.testing.assert_allclose(told.rotation, bundle.rotation, atol=np.radians(0.02))
