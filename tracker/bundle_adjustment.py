@@ -179,6 +179,8 @@ class _Problem:
         self._focal_precision = sd_log**-2 if sd_log else 0.0
         self._free = slice(0 if sd_log else 1, None)  # of log(focal) and shape
         self._row, self._point = scene.rows(), scene.observations[:, 1].astype(int)
+        # [O] px, as the prior's camera sees points that go along with the lips.
+        self._moving = focal * surface.moving[self._point] / scene.translation[self._row, 2]
         self._seen = scene.observations[:, 2:]
         length = np.bincount(self._point)
         # The error of a track hardly changes from one frame to the next: tracks count, not observations.
@@ -193,7 +195,8 @@ class _Problem:
         self._off_scale = NO_OUTLIERS if loose else OFF_SCALE
         covariance = np.linalg.inv(self._surface.precision) + loose**2 * np.eye(3)
         self._precision = np.linalg.inv(covariance)
-        self._noise = max(LEAST_NOISE_PX, 1.4826 * float(np.median(np.abs(self._residuals(state)[0]))))
+        noise = max(LEAST_NOISE_PX, 1.4826 * float(np.median(np.abs(self._residuals(state)[0]))))
+        self._noise = np.hypot(noise, self._moving)
 
     def points(self, state: _State) -> F64:
         """[Q, 3] m."""

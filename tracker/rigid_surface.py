@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
+from tracker.energy import Weights
 from tracker.feature_tracks import FeatureTracks
 from tracker.head import HeadModel
+from tracker.modes import head_modes, movements
 from tracker.track import F64
 
 # Heads beyond the basis, and landmarks that lie elsewhere on another head.
@@ -21,21 +23,25 @@ BEND_M, BEND_LENGTH_M = 0.003, 0.04
 OFF_SURFACE_M = 0.001  # of a point from its smooth surface
 ALONG_SURFACE_M = 0.004  # of a point on it: landmarks slide when the head turns
 KEPT = 0.999  # of the variance
+SPEECH_M = 0.0019  # rms, by which lips move about their mean in speech (two people, docs/figures.md)
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
     """A normal distribution of Q points: mean [Q, 3] m, what R modes of unit variance move together [Q, 3, R] m, and
     the precision of each one's own departure [Q, 3, 3] 1/m^2.
+
+    moving: [Q] m, rms by which each goes along with speaking lips: no skin is quite rigid.
     """
 
     mean: F64
     modes: F64
     precision: F64
+    moving: F64
 
     def select(self, rows: NDArray[np.integer]) -> SurfacePoints:
         """Some of the points."""
-        return SurfacePoints(self.mean[rows], self.modes[rows], self.precision[rows])
+        return SurfacePoints(*(part[rows] for part in vars(self).values()))
 
 
 def surface_points(
@@ -46,7 +52,8 @@ def surface_points(
     xy: [M, L, 2] px, the head's `rigid` landmarks in the frames of the tracks.
     """
     mean, modes, normals = _landmark_surface(head, rigid)
-    known = np.concatenate([mean, normals, modes.reshape(len(mean), -1)], axis=1)
+    moving = moved_by_speech(head)[rigid, None]
+    known = np.concatenate([mean, normals, moving, modes.reshape(len(mean), -1)], axis=1)
     number = tracks.observations[:, 1].astype(int)
     count = int(number.max(initial=-1)) + 1
     total, seen = np.zeros((count, known.shape[1])), np.zeros(count)
@@ -62,7 +69,20 @@ def surface_points(
     normal = total[:, 3:6] / np.linalg.norm(total[:, 3:6], axis=1, keepdims=True)
     outward = normal[:, :, None] * normal[:, None]
     precision = outward / OFF_SURFACE_M**2 + (np.eye(3) - outward) / ALONG_SURFACE_M**2
-    return SurfacePoints(total[:, :3], total[:, 6:].reshape(count, 3, modes.shape[2]), precision)
+    return SurfacePoints(total[:, :3], total[:, 7:].reshape(count, 3, modes.shape[2]), precision, total[:, 6])
+
+
+def moved_by_speech(head: HeadModel) -> F64:
+    """[L] m, rms by which the head's landmarks go along with lips that move by SPEECH_M.
+
+    Each of the head's movements counts as it moves the lips: brows and lids, which do not, for nothing.
+    """
+    embedding = head.landmark_embedding
+    moves = np.tensordot(head_modes(head, Weights()).to_head, movements(head), axes=1)
+    lips = (moves[:, head.regions["lips"]] ** 2).sum(2).mean(1)
+    corners, share = head.faces[embedding.triangles], embedding.barycentric
+    along = (np.einsum("lc,klci->kli", share, moves[:, corners]) ** 2).sum(2)
+    return np.asarray(SPEECH_M * np.sqrt(lips @ along / (lips @ lips)), np.float64)
 
 
 def _landmark_surface(head: HeadModel, rigid: NDArray[np.bool_]) -> tuple[F64, F64, F64]:

@@ -13,10 +13,10 @@ from tracker.bundle_adjustment import RigidScene, _Problem, _State, absolute_pos
 from tracker.camera import PRIOR_FOCAL, PRIOR_SD_LOG, estimate_camera
 from tracker.feature_tracks import FeatureFollower, FeatureTracks
 from tracker.head import load_head
-from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
+from tracker.landmark_indices import BLENDSHAPE_NAMES, LIPS, POINTS
 from tracker.patch_registration import cut_templates, fine_texture, register
 from tracker.raster import project, rasterize
-from tracker.rigid_surface import SurfacePoints
+from tracker.rigid_surface import SPEECH_M, SurfacePoints, moved_by_speech
 from tracker.track import Camera, Landmarks
 
 HEAD = load_head()
@@ -198,7 +198,10 @@ def scene(noise_px: float, seed: int = 0) -> tuple[RigidScene, SurfacePoints]:
     modes = 0.002 * rng.standard_normal((150, 3, 3))
     bent = points + modes @ rng.standard_normal(3) + 0.001 * rng.standard_normal(points.shape)
     precision = np.broadcast_to(np.eye(3) / 0.001**2, (300, 3, 3))
-    return true, SurfacePoints(np.concatenate([bent, bent]), np.concatenate([modes, modes]), precision)
+    surface = SurfacePoints(
+        np.concatenate([bent, bent]), np.concatenate([modes, modes]), precision, moving=np.zeros(300)
+    )
+    return true, surface
 
 
 def test_bundle_adjustment_finds_the_focal_length_and_knows_how_well():
@@ -217,7 +220,8 @@ def test_bundle_adjustment_of_one_shot_with_points_known_to_three_millimetres():
     observations = true.observations.copy()
     observations[:, 1] %= 150
     points = true.points[:150] + 0.003 * np.random.default_rng(4).standard_normal((150, 3))
-    surface = SurfacePoints(points, np.zeros((150, 3, 0)), np.broadcast_to(np.eye(3) / 0.003**2, (150, 3, 3)))
+    precision = np.broadcast_to(np.eye(3) / 0.003**2, (150, 3, 3))
+    surface = SurfacePoints(points, np.zeros((150, 3, 0)), precision, moving=np.zeros(150))
     prior = PRIOR_FOCAL * max(SIZE)
     start = replace(
         true,
@@ -229,6 +233,34 @@ def test_bundle_adjustment_of_one_shot_with_points_known_to_three_millimetres():
     assert focal == pytest.approx(FOCAL, rel=0.03)
     assert abs(np.log(focal / FOCAL)) < 2.5 * sd_log
     assert np.std(adjusted.residuals(focal, PRINCIPAL)) < 0.32
+
+
+def test_points_that_go_along_with_the_lips_lead_the_adjustment_less_astray():
+    true, surface = scene(0.3)
+    low = true.points[:, 1] < np.quantile(true.points[:, 1], 0.4)
+    moving = np.where(low, 0.001, 0.0)
+    observations, rows = true.observations.copy(), true.rows()
+    # Skin stretched more the farther the head is turned, which a flatter head would do as well.
+    turned = Rotation.from_matrix(true.rotation).as_rotvec()[rows, 1]
+    scale = FOCAL / true.translation[rows, 2]
+    observations[:, 2] += scale * moving[observations[:, 1].astype(int)] * turned / turned.std()
+    seen = replace(true, observations=observations)
+    astray, led = (
+        adjust(seen, replace(surface, moving=known), PRINCIPAL, PRIOR_FOCAL * max(SIZE), PRIOR_SD_LOG)
+        for known in (np.zeros_like(moving), moving)
+    )
+    errors = []
+    for scene_, _, _ in (astray, led):
+        between = Rotation.from_matrix(scene_.rotation) * Rotation.from_matrix(true.rotation).inv()
+        errors.append((between * between.mean().inv()).magnitude().mean())
+    assert errors[1] < 0.8 * errors[0]
+
+
+def test_skin_goes_along_with_the_lips_the_more_the_nearer_it_is():
+    moved = dict(zip(HEAD.landmark_embedding.landmarks.tolist(), moved_by_speech(HEAD).tolist()))
+    forehead, bridge, tip, cheek, lip = (moved[index] for index in (10, 6, 4, 50, 14))
+    assert forehead < 1e-6 and bridge < 5e-5 < tip < cheek < lip
+    assert np.mean([moved[index] for index in LIPS]) == pytest.approx(SPEECH_M, rel=0.2)
 
 
 def test_a_known_focal_length_stays():
