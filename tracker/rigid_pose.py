@@ -29,7 +29,7 @@ CERTAIN = np.array([[1.0], [1.0], [0.1]])  # of a landmark pose's place: depth i
 LEAST_SEEN = 0.3  # of the points that a frame of the bundle usually sees: with fewer its pose may be anything
 # Standard deviations of the logarithm of how far a head is found to turn, as 14 films have it: of the bundle, a share
 # of its focal length's; of the landmarks, whose poses err besides by so much (rad) each, some frames alike.
-BUNDLE_TURN, LANDMARK_TURN = 0.5, 0.06
+BUNDLE_TURN, LANDMARK_TURN = 0.55, 0.06
 LANDMARK_POSE, ALIKE = 0.0175, 4
 MOST_TURN = 2.0  # that factor, or its inverse
 FADE_S = 0.48  # beyond the last frame known: the time over which its correction fades
