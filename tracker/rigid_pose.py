@@ -27,10 +27,11 @@ Corrections = list[tuple[F64, F64]]  # times [k] s and corrections [k, 6] of a s
 MIN_FRAMES = 8  # fewer do not tell how the two head frames lie to each other
 CERTAIN = np.array([[1.0], [1.0], [0.1]])  # of a landmark pose's place: depth is seen ten times less well
 LEAST_SEEN = 0.3  # of the points that a frame of the bundle usually sees: with fewer its pose may be anything
-# Standard deviations of the logarithm of how far a head is found to turn, as 14 films have it: of the bundle, a share
-# of its focal length's; of the landmarks, whose poses err besides by so much (rad) each, some frames alike.
-BUNDLE_TURN, LANDMARK_TURN = 0.55, 0.06
-LANDMARK_POSE, ALIKE = 0.0175, 4
+# How far a head is found to turn errs by these standard deviations of its logarithm. The bundle's: shares of its focal
+# length's, as 12 films have it, and as two have it on which hair lies over the forehead; how likely the second is.
+USUAL_TURN, ASTRAY_TURN, ASTRAY = 0.35, 1.25, 0.15
+# The landmarks', and that of their poses (rad), which err in blocks that move with the head, however many there are.
+LANDMARK_TURN, LANDMARK_POSE = 0.06, 0.006
 MOST_TURN = 2.0  # that factor, or its inverse
 FADE_S = 0.48  # beyond the last frame known: the time over which its correction fades
 
@@ -38,9 +39,10 @@ FADE_S = 0.48  # beyond the last frame known: the time over which its correction
 def turned_as_far(bundle: Bundle, x: F64, good: Rows, sound: Rows, focal_sd_log: float) -> Bundle:
     """The bundle whose heads turn as far from their mean pose as it and the poses in x [n, P] tell together.
 
-    good: [n], frames of x. sound: its rows that are believed. focal_sd_log: of the bundle's focal length.
+    good: [n], frames of x. sound: its rows that are believed. focal_sd_log: of the bundle's focal length. Where
+    the two differ little the bundle mostly knows better; where they differ much it has been led astray.
     """
-    known = np.isin(bundle.frame, good[sound])
+    known = np.isin(bundle.frame, good[sound]) & _well_seen(bundle)
     if known.sum() < MIN_FRAMES:
         return bundle
     rotation = Rotation.from_rotvec(bundle.rotation).as_matrix()
@@ -48,10 +50,10 @@ def turned_as_far(bundle: Bundle, x: F64, good: Rows, sound: Rows, focal_sd_log:
     middle = Rotation.from_matrix(rotation[known]).mean()
     turn = (Rotation.from_matrix(rotation) * middle.inv()).as_rotvec()
     told = (Rotation.from_matrix(own) * Rotation.from_matrix(own).mean().inv()).as_rotvec()
-    square = float((turn[known] ** 2).sum())
-    factor = np.clip((told * turn[known]).sum() / max(square, 1e-9), 1 / MOST_TURN, MOST_TURN)
-    certain = LANDMARK_TURN**2 + ALIKE * LANDMARK_POSE**2 / max(square, 1e-9)
-    factor **= 1 / (1 + certain / max((BUNDLE_TURN * focal_sd_log) ** 2, 1e-9))
+    square = max(float((turn[known] ** 2).sum()), 1e-9)
+    factor = float(np.clip((told * turn[known]).sum() / square, 1 / MOST_TURN, MOST_TURN))
+    certain = LANDMARK_TURN**2 + LANDMARK_POSE**2 * known.sum() / square
+    factor **= _share(np.log(factor), certain, focal_sd_log)
     turned = (Rotation.from_rotvec(factor * turn) * middle).as_matrix()
     # The face turns in its place.
     centre = bundle.points.mean(0, dtype=np.float64) if len(bundle.points) else np.zeros(3)
@@ -60,6 +62,18 @@ def turned_as_far(bundle: Bundle, x: F64, good: Rows, sound: Rows, focal_sd_log:
         rotation=Rotation.from_matrix(turned).as_rotvec().astype(np.float32),
         translation=(bundle.translation + (rotation - turned) @ centre).astype(np.float32),
     )
+
+
+def _share(apart: float, certain: float, focal_sd_log: float) -> float:
+    """0..1, how far to go from the bundle's to the landmarks' turns, whose logarithms lie `apart`.
+
+    certain: variance of the landmarks'. The expectation over what the bundle may be: as good as usual, or led astray.
+    """
+    own = (np.array([USUAL_TURN, ASTRAY_TURN]) * focal_sd_log) ** 2
+    likely = (
+        np.array([1 - ASTRAY, ASTRAY]) * np.exp(-0.5 * apart**2 / (own + certain)) / np.sqrt(own + certain)
+    )
+    return float((likely * own / (own + certain)).sum() / max(float(likely.sum()), 1e-300))
 
 
 def hold_poses(
