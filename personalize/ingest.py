@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from personalize.errors import UserError
 from personalize.people import FaceFollower, Tracklet, main_person
 from personalize.pictures import read_frames
 from personalize.shots import (
+    CUT_WINDOW_S,
     F32,
     F64,
     MAX_GAP_S,
@@ -25,6 +27,7 @@ from personalize.shots import (
     difference,
     find_shots,
     repeated,
+    sudden,
     thumbnail,
     usable_seconds,
 )
@@ -172,6 +175,7 @@ def _looked_through(media: MediaInfo, progress: Progress) -> tuple[F64, F64, Boo
     """
     reader, follower = read_frames(media.path, SEARCH_SIDE), FaceFollower(FaceLandmarker())
     expected = max(1, round(media.duration_s * media.fps))
+    recent = deque[float](maxlen=max(3, round(CUT_WINDOW_S * media.fps)))
     rows = []
     last: F32 | None = None
     for index, (time, rgb) in enumerate(reader):
@@ -179,7 +183,8 @@ def _looked_through(media: MediaInfo, progress: Progress) -> tuple[F64, F64, Boo
         change, equal = difference(grey, last) if last is not None else (0.0, False)
         rows.append((time, change, equal, reader.damaged))
         last = grey
-        follower.add(index, time, rgb)
+        follower.add(index, time, rgb, sudden(change, recent))
+        recent.append(change)
         if progress is not None:
             progress(min(len(rows), expected), expected)
     times, changes, same, damaged = zip(*rows)

@@ -21,9 +21,7 @@ MIDDLE = np.s_[PATCH // 4 :, PATCH // 5 : -PATCH // 5]  # of it: no background, 
 BRIGHTEST = 250  # a colour value that the camera may have cut off
 MIN_OVERLAP = 0.3  # intersection over union of a face's boxes from one picture to the next
 MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
-SAMPLE_S = (
-    0.4  # time between two looks at the face's shape: less than any shot that is tracked, so each has one
-)
+SAMPLE_S = 0.6  # time between two looks at the face's shape
 MIN_PRESENCE = 0.5  # of the landmarker: what it does not take for a face is none, whatever the detector says
 SEARCH_S = 1.0  # between searches for small faces in tiles while none is seen
 PORTRAIT = (12, 14)  # px, width and height of the grey picture that people are told apart by
@@ -100,8 +98,11 @@ class FaceFollower:
         self._next_search = -1.0
         self.tracklets: list[Tracklet] = []
 
-    def add(self, index: int, time: float, rgb: U8) -> None:
-        """Look at the next picture [H, W, 3]."""
+    def add(self, index: int, time: float, rgb: U8, sudden: bool = False) -> None:
+        """Look at the next picture [H, W, 3]. sudden: there may be a cut before it, and every face another one."""
+        if sudden:
+            for followed in self._open:
+                followed.next_sample = time
         self._open = [t for t in self._open if time - t.sightings[-1].time <= MAX_LOST_S]
         waiting = list(self._open)
         for face in self._find(time, rgb):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -25,6 +26,7 @@ MAX_GAP_S = 0.25  # a longer time between two pictures ends a shot: nothing is k
 MIN_SHOT_S = 0.5  # shorter shots are left out: too little to track
 # A cut changes the picture by so much (grey levels, mean) and so many times more than its neighbours in time.
 CUT_LEVEL, CUT_RATIO, CUT_WINDOW_S = 1.5, 1.9, 0.28
+USUAL_CHANGE = 0.5  # grey levels, that any two pictures differ by
 SAME_LEVEL = 1.0  # grey levels: no pixel of the thumbnail changes by more in a repeated picture
 # One that was coded anew changes by less than this (mean), and by so small a share of what pictures around it do.
 CODED_LEVEL, CODED_SHARE = 0.12, 0.15
@@ -73,6 +75,11 @@ def difference(grey: F32, last: F32) -> tuple[float, bool]:
     return float(change.mean()), bool(change.max() <= SAME_LEVEL)
 
 
+def sudden(change: float, before: Sequence[float]) -> bool:
+    """Whether `find_shots`, which knows the pictures behind too, may take a `change` after those `before` for a cut."""
+    return change > CUT_LEVEL and change > CUT_RATIO * (sorted([0.0, 0.0, *before])[-2] + USUAL_CHANGE)
+
+
 def repeated(time: F64, change: F64, same: Bool) -> Bool:
     """[T] pictures that repeat the one before: those that are the `same`, and those coded as if they were new ones.
 
@@ -102,7 +109,7 @@ def find_shots(time: F64, change: F64) -> NDArray[np.int32]:
     padded = np.pad(rate, window, mode="reflect" if len(rate) > window else "edge")
     around = np.stack([padded[i : i + len(rate)] for i in range(2 * window + 1) if i != window])
     # The second largest, so that two cuts near each other are both found.
-    usual = np.sort(around, axis=0)[-2] + 0.5
+    usual = np.sort(around, axis=0)[-2] + USUAL_CHANGE
     first = (step > MAX_GAP_S) | ((rate > CUT_LEVEL) & (rate > CUT_RATIO * usual))
     first[0] = True
     return (np.cumsum(first) - 1).astype(np.int32)

@@ -19,7 +19,8 @@ _factorize = CFUNCTYPE(None, *[c_void_p] * 6)(
 def solve_banded(band: F64, right: F64) -> F64:
     """x [N] of A x = right [N] by Cholesky's factorization, which overwrites band.
 
-    band: [N, b+1], band[j, o] = A[j + o, j]. Raises LinAlgError if A is not positive definite.
+    band: [N, b+1], band[j, o] = A[j + o, j]; contiguous f64, or a copy is overwritten. Raises LinAlgError if A is not
+    positive definite; what is NaN stays so.
     """
     band = np.ascontiguousarray(band, np.float64)
     size, width = band.shape

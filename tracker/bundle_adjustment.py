@@ -179,7 +179,8 @@ class _Problem:
         self._focal_precision = sd_log**-2 if sd_log else 0.0
         self._free = slice(0 if sd_log else 1, None)  # of log(focal) and shape
         self._row, self._point = scene.rows(), scene.observations[:, 1].astype(int)
-        # [O] px, as the prior's camera sees points that go along with the lips.
+        # [O] px, as the prior's camera sees points that go along with the lips: the whole of it in either direction,
+        # since neighbours go alike, and do not average out.
         self._moving = focal * surface.moving[self._point] / scene.translation[self._row, 2]
         self._seen = scene.observations[:, 2:]
         length = np.bincount(self._point)

@@ -33,6 +33,8 @@ USUAL_TURN, ASTRAY_TURN, ASTRAY = 0.35, 1.25, 0.15
 # The landmarks', and that of their poses (rad), which err in blocks that move with the head, however many there are.
 LANDMARK_TURN, LANDMARK_POSE = 0.06, 0.006
 MOST_TURN = 2.0  # that factor, or its inverse
+LEAST_FOCAL_SD = 0.08  # a focal length that is given leaves open how deep the points lie, too
+ROUNDS, FAR = 8, 2.0  # of telling which frames are far off, in times of what is usual
 FADE_S = 0.48  # beyond the last frame known: the time over which its correction fades
 
 
@@ -40,27 +42,32 @@ def turned_as_far(bundle: Bundle, x: F64, good: Rows, sound: Rows, focal_sd_log:
     """The bundle whose heads turn as far from their mean pose as it and the poses in x [n, P] tell together.
 
     good: [n], frames of x. sound: its rows that are believed. focal_sd_log: of the bundle's focal length. Where
-    the two differ little the bundle mostly knows better; where they differ much it has been led astray.
+    the two differ little the bundle mostly knows better; where they differ much it has been led astray. Its points and
+    observations stay as they were.
     """
     known = np.isin(bundle.frame, good[sound]) & _well_seen(bundle)
     if known.sum() < MIN_FRAMES:
         return bundle
-    rotation = Rotation.from_rotvec(bundle.rotation).as_matrix()
-    own = rotation_matrix(x[np.searchsorted(good, bundle.frame[known]), -6:-3])
-    middle = Rotation.from_matrix(rotation[known]).mean()
-    turn = (Rotation.from_matrix(rotation) * middle.inv()).as_rotvec()
-    told = (Rotation.from_matrix(own) * Rotation.from_matrix(own).mean().inv()).as_rotvec()
-    square = max(float((turn[known] ** 2).sum()), 1e-9)
-    factor = float(np.clip((told * turn[known]).sum() / square, 1 / MOST_TURN, MOST_TURN))
-    certain = LANDMARK_TURN**2 + LANDMARK_POSE**2 * known.sum() / square
-    factor **= _share(np.log(factor), certain, focal_sd_log)
-    turned = (Rotation.from_rotvec(factor * turn) * middle).as_matrix()
+    rotation = Rotation.from_rotvec(bundle.rotation)
+    own = Rotation.from_matrix(rotation_matrix(x[np.searchsorted(good, bundle.frame[known]), -6:-3]))
+    weight = np.ones(int(known.sum()))
+    for _ in range(ROUNDS):  # a frame whose patches were led astray tells nothing
+        middle = rotation[known].mean(weight)
+        turn = (rotation * middle.inv()).as_rotvec()
+        told = (own * own.mean(weight).inv()).as_rotvec()
+        square = max(float(weight @ (turn[known] ** 2).sum(1)), 1e-9)
+        factor = float(np.clip(weight @ (told * turn[known]).sum(1) / square, 1 / MOST_TURN, MOST_TURN))
+        away = np.linalg.norm(told - factor * turn[known], axis=1)
+        weight = 1 / (1 + (away / max(FAR * float(np.median(away)), 1e-6)) ** 2)
+    certain = LANDMARK_TURN**2 + LANDMARK_POSE**2 * weight.sum() / square
+    factor **= _share(np.log(factor), certain, max(focal_sd_log, LEAST_FOCAL_SD))
+    turned = Rotation.from_rotvec(factor * turn) * middle
     # The face turns in its place.
     centre = bundle.points.mean(0, dtype=np.float64) if len(bundle.points) else np.zeros(3)
     return replace(
         bundle,
-        rotation=Rotation.from_matrix(turned).as_rotvec().astype(np.float32),
-        translation=(bundle.translation + (rotation - turned) @ centre).astype(np.float32),
+        rotation=turned.as_rotvec().astype(np.float32),
+        translation=(bundle.translation + rotation.apply(centre) - turned.apply(centre)).astype(np.float32),
     )
 
 

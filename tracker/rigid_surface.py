@@ -23,7 +23,7 @@ BEND_M, BEND_LENGTH_M = 0.003, 0.04
 OFF_SURFACE_M = 0.001  # of a point from its smooth surface
 ALONG_SURFACE_M = 0.004  # of a point on it: landmarks slide when the head turns
 KEPT = 0.999  # of the variance
-SPEECH_M = 0.0019  # rms, by which lips move about their mean in speech (two people, docs/figures.md)
+SPEECH_M = 0.0019  # by which lips move about their mean in speech: l2_lip of the mean motion, docs/figures.md
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class SurfacePoints:
     """A normal distribution of Q points: mean [Q, 3] m, what R modes of unit variance move together [Q, 3, R] m, and
     the precision of each one's own departure [Q, 3, 3] 1/m^2.
 
-    moving: [Q] m, rms by which each goes along with speaking lips: no skin is quite rigid.
+    moving: [Q] m, rms distance by which each goes along with speaking lips: no skin is quite rigid.
     """
 
     mean: F64
@@ -41,7 +41,7 @@ class SurfacePoints:
 
     def select(self, rows: NDArray[np.integer]) -> SurfacePoints:
         """Some of the points."""
-        return SurfacePoints(*(part[rows] for part in vars(self).values()))
+        return SurfacePoints(self.mean[rows], self.modes[rows], self.precision[rows], self.moving[rows])
 
 
 def surface_points(
@@ -73,7 +73,7 @@ def surface_points(
 
 
 def moved_by_speech(head: HeadModel) -> F64:
-    """[L] m, rms by which the head's landmarks go along with lips that move by SPEECH_M.
+    """[L] m, rms distance by which the head's landmarks go along with lips that move by SPEECH_M.
 
     Each of the head's movements counts as it moves the lips: brows and lids, which do not, for nothing.
     """

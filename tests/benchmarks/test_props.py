@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from benchmarks.props import glasses, hair, hand, tube
 from tracker.head import load_head
@@ -17,6 +18,19 @@ def test_tube_has_the_volume_of_a_cylinder() -> None:
     radius[[0, -1]] = 0
     prism = 10 / 2 * np.sin(2 * np.pi / 10) * 0.01**2 * 0.1  # ten sides
     assert volume(*tube(points, radius)) == pytest.approx(prism, rel=0.02)
+
+
+def test_hair_lies_upon_the_head_and_leaves_eyes_and_mouth_bare() -> None:
+    head = load_head()
+    strands = hair(head, np.ones(3)).vertices
+    skin = head.template[np.concatenate([head.regions["face"], head.regions["scalp"]])]
+    front = skin[skin[:, 2] > 0.02]
+    above, near = KDTree(front[:, :2]).query(strands[:, :2])
+    inside = above < 0.004
+    assert (strands[inside, 2] > front[near[inside], 2] - 0.002).mean() > 0.98
+    for name in ("left_iris", "right_iris", "lips"):
+        low, high = head.template[head.regions[name], :2].min(0), head.template[head.regions[name], :2].max(0)
+        assert not ((strands[:, :2] > low) & (strands[:, :2] < high)).all(1).any()
 
 
 def test_glasses_and_hand_turn_outward_and_stand_before_the_face() -> None:

@@ -14,12 +14,12 @@ from personalize.errors import UserError
 from personalize.ingest import MIN_USABLE_S, find_usable, ingest_video
 from personalize.people import FaceFollower, Sighting, Tracklet, main_person
 from personalize.shots import (
-    MIN_SHOT_S,
     REASONS,
     Frames,
     difference,
     find_shots,
     repeated,
+    sudden,
     thumbnail,
     usable_seconds,
 )
@@ -244,22 +244,29 @@ def test_how_much_of_a_face_is_cut_off_is_measured() -> None:
     assert follower.tracklets[0].sightings[0].burnt == pytest.approx(1 / 3, abs=0.02)
 
 
-@pytest.mark.parametrize("fps", [12, 25, 60])
-def test_a_face_followed_across_cuts_is_looked_at_in_every_shot(fps: int) -> None:
+def test_behind_a_cut_a_face_is_looked_at_anew_however_shortly_it_is_seen() -> None:
     face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
     points = np.random.default_rng(0).normal(200, 40, (478, 3)).astype(np.float32)
-    landmarker = Mock(detect=lambda rgb: [face], landmarks=lambda *_: (points, 0.9, None))
+    landmarker = Mock(landmarks=lambda *_: (points, 0.9, None))
     follower, picture = FaceFollower(landmarker), np.full((480, 640, 3), 90, np.uint8)
-    time = np.arange(6 * fps) / fps
-    for index, moment in enumerate(time):
-        follower.add(index, float(moment), picture)
-    segment = np.unique((time / (1.05 * MIN_SHOT_S)).astype(np.int32), return_inverse=True)[1]
+    gone = {33, *range(36, 60)}  # the first picture behind the cut, and soon for good
+    for index in range(60):
+        landmarker.detect = lambda *_, index=index, **__: [] if index in gone else [face]
+        follower.add(index, index / 25, picture, sudden=index == 33)
     (followed,) = follower.tracklets
-    shots = followed.shots(segment.astype(np.int32))
-    assert [shot.frames for shot in shots] == [
-        np.flatnonzero(segment == s).tolist() for s in np.unique(segment)
-    ]
-    assert all(shot.shapes for shot in shots if len(shot.frames) > MIN_SHOT_S * fps)
+    before, behind = followed.shots((np.arange(60) >= 33).astype(np.int32))
+    assert before.frames == list(range(33)) and behind.frames == [34, 35]
+    assert len(before.shapes) == 3 and len(behind.shapes) == 1
+
+
+def test_what_may_be_a_cut_holds_every_cut() -> None:
+    random = np.random.default_rng(1)
+    for scale in (0.2, 1.0, 4.0):
+        change = random.gamma(1.0, scale, 400)
+        change[random.choice(400, 12, replace=False)] += 12.0
+        first = np.flatnonzero(np.diff(find_shots(np.arange(400) / 25, change))) + 1
+        assert len(first) > 3
+        assert all(sudden(change[i], change[max(i - 7, 0) : i]) for i in first)
 
 
 def test_what_moves_in_the_dark_is_no_repeated_picture() -> None:

@@ -145,7 +145,7 @@ def turn_deg(bundle: Bundle) -> float:
         (0.75, 0.15, 0.7, 1.0),  # the bundle must have been led astray
         (1.3, 0.15, 0.7, 1.0),
         (0.95, 0.15, 0.15, 0.5),  # either may err by that
-        (0.75, 0.02, 0.0, 0.1),  # the bundle knows
+        (0.95, 0.0, 0.0, 0.3),  # the focal length is given
     ],
 )
 def test_a_bundle_turns_as_far_as_landmarks_and_it_tell_together(
@@ -160,6 +160,19 @@ def test_a_bundle_turns_as_far_as_landmarks_and_it_tell_together(
         Rotation.from_rotvec(b.rotation).apply(b.points.mean(0)) + b.translation for b in (wrong, right)
     )
     np.testing.assert_allclose(after, before, atol=1e-5)  # the face stays where it was seen
+
+
+@pytest.mark.parametrize("jump", [0.4, 0.8, 2.0])
+def test_a_frame_with_a_wrong_pose_does_not_shrink_the_others(truth: np.ndarray, jump: float) -> None:
+    exact = bundle_of(truth, GOOD[::STEP])
+    wrong = flattened(exact, 1.0)
+    wrong.rotation[17] += [0.0, jump, 0.0]
+    noise = np.pad(np.random.default_rng(2).normal(0, np.radians(0.4), (FRAMES, 3)), ((0, 0), (2, 3)))
+    right = turned_as_far(wrong, truth + noise, GOOD, GOOD, 0.15)
+    others = np.delete(np.arange(len(wrong.frame)), 17)
+    left, whole = (Rotation.from_rotvec(b.rotation[others]) for b in (right, exact))
+    turns = [(r * r.mean().inv()).magnitude().mean() for r in (left, whole)]
+    assert turns[0] == pytest.approx(turns[1], rel=0.03)
 
 
 def test_a_head_that_hardly_turns_or_is_hardly_known_says_nothing_of_how_far(truth: np.ndarray) -> None:
