@@ -183,7 +183,8 @@ def _looked_through(media: MediaInfo, progress: Progress) -> tuple[F64, F64, Boo
         change, equal = difference(grey, last) if last is not None else (0.0, False)
         rows.append((time, change, equal, reader.damaged))
         last = grey
-        follower.add(index, time, rgb, sudden(change, recent))
+        gap = len(rows) > 1 and time - rows[-2][0] > MAX_GAP_S
+        follower.add(index, time, rgb, gap or sudden(change, recent))
         recent.append(change)
         if progress is not None:
             progress(min(len(rows), expected), expected)
