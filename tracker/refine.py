@@ -64,8 +64,9 @@ def refine_track(
 
     segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
     each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
-    look like keeps its landmark fit, and so does one whose picture is missing. bundle: its poses are taken where skin
-    looks more alike from frame to frame under them; they end halfway between what grey levels and the bundle tell.
+    look like keeps its landmark fit, and so does one whose picture is missing. bundle: its poses, turned as far as
+    they and the landmarks tell together, are taken where skin looks more alike from frame to frame under them; they end
+    halfway between what grey levels and the bundle tell.
     evidence: see `fit_track`.
     What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips and by how the
     lips move (tracker/lip_opening.py, tracker/lip_motion.py), depth by how the skin shifts in a turn
