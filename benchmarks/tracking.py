@@ -3,11 +3,12 @@
 person    the embedded head itself as noisy landmarks, true focal: lower bounds, since truth and fit share the head
 inside    a film of the embedded head
 own       films of heads that the model cannot imitate (benchmarks/rendered_heads.py), made once and kept
+unseen    six such films drawn by lot (benchmarks/strangers.py), by which no method and no constant is chosen
 shared    rendered scan heads of the shared data ($PERSONALIZE_SHARED), where it is at hand
 
 Films go through the pipeline's own stages: usable frames, landmarks, camera, fit. NAMEs (`hand`, `person1`) choose
-clips; for a VIDEO only consistency can be told. At the end: the numbers wanted, and whether they are reached,
-in all and by group.
+clips; `stranger101` and up draw further ones, by which methods may be chosen; for a VIDEO only consistency can be
+told. At the end: the numbers wanted, and whether they are reached, in all and by group.
 
 surf, mean      distance of the neutral face from the true surface after one similarity; of the mean head's, mm
 face, rigid     face vertices, neutral and motion, after one similarity a clip and after one rigid transform, mm
@@ -41,6 +42,7 @@ from benchmarks.ground_truth import GroundTruth
 from benchmarks.in_model import noisy_landmarks
 from benchmarks.real_tracks import agreement, eye_distance, raw_openings
 from benchmarks.rendered_heads import SCENES
+from benchmarks.strangers import number_of, strangers
 from benchmarks.track_bars import Row, print_bars
 from benchmarks.track_errors import compare
 from personalize.container import probe
@@ -157,10 +159,13 @@ def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str,
         if wanted(f"person{seed}", chosen):
             truth, landmarks = noisy_landmarks(head, PERSON_FRAMES, seed)
             yield "person", f"person{seed}", only_landmarks(landmarks, truth.focal), truth
-    for scene in SCENES:
-        if wanted(scene.name, chosen):
-            video, truth = film(scene, head)
-            yield ("own" if scene.bend_mm else "inside"), scene.name, watched(video, head), truth
+    made = [
+        *(("own" if scene.bend_mm else "inside", scene) for scene in SCENES if wanted(scene.name, chosen)),
+        *(("unseen", scene) for scene in strangers(chosen)),
+    ]
+    for group, scene in made:
+        video, truth = film(scene, head)
+        yield group, scene.name, watched(video, head), truth
     for path in scan_heads():
         if wanted(path.stem, chosen):
             yield "shared", path.stem, watched(path.with_suffix(".mp4"), head), GroundTruth.load(path)
@@ -218,8 +223,8 @@ def main() -> None:
     named = parser.parse_args().clips
     videos = [Path(name) for name in named if Path(name).suffix]
     chosen = {name for name in named if not Path(name).suffix}
-    if unknown := chosen - set(known_names()):
-        parser.error(f"no clip {', '.join(sorted(unknown))}; there are {', '.join(known_names())}")
+    if unknown := {name for name in chosen - set(known_names()) if number_of(name) is None}:
+        parser.error(f"no clip {', '.join(sorted(unknown))}; there are {', '.join(known_names())}, strangerN")
     if not named and not scan_heads():
         print("without rendered scan heads: $PERSONALIZE_SHARED does not name a folder with data/gt")
     head, rows = load_head(), list[Row]()

@@ -28,10 +28,10 @@ ROUNDS = 3  # in which they tell how high the mouth is
 OPEN_MM = 2.5  # lips farther apart than this show what is inside
 # From the landmarks' edges, where either may be seen. They lie outside more often than inside: wide openings are read
 # wider still, by about a tenth.
-LIP_MARGIN_MM, INSIDE_MARGIN_MM, INSIDE_SHARE = 0.5, 0.8, 0.15
+LIP_MARGIN_MM, INSIDE_MARGIN_MM, INSIDE_SHARE = 0.5, 0.8, 0.2
 LEAST_INSIDE = 100  # samples; with fewer the clip hardly shows an open mouth
 MISTAKEN = 0.25  # share of what is inside that looks more like lips: above, the clip's colours tell nothing
-DOUBT = 1.0  # log likelihood ratio up to which a colour tells nothing: a tongue is nearly that of lips
+DOUBT = 0.5  # log likelihood ratio up to which a colour tells nothing: a tongue is nearly that of lips
 TRUSTED = 3.0  # the most that one sample counts, as log likelihood ratio
 PRIOR_MM = 1.0  # standard deviation of width and middle about the marks'
 # Of a grey level, about. Lens and motion mix light, not the logarithms of colours.

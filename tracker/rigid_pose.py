@@ -4,9 +4,9 @@ Landmarks err in blocks that move with the head, so a pose fitted to them swings
 not, but they stand in a head frame of their own and exist on every third frame or so; the difference to the
 landmarks' poses, one similarity for the clip taken out, is carried over to the frames between.
 
-A large turn of a flat face moves a point as a small one of a deep face does. Where hair, or a long lens, leaves open
-how deep the points lie, all turns of the bundle are too large or too small by one factor, which landmarks, fitted by a
-head of usual depth, tell.
+A large turn of a flat face moves a point as a small one of a deep face does. Where a short clip, or a long lens, leaves
+open how deep the points lie, all turns of the bundle are too large or too small by one factor, which landmarks, fitted
+by a head of usual depth, tell, unless they are led astray themselves.
 """
 
 from __future__ import annotations
@@ -27,11 +27,13 @@ Corrections = list[tuple[F64, F64]]  # times [k] s and corrections [k, 6] of a s
 MIN_FRAMES = 8  # fewer do not tell how the two head frames lie to each other
 CERTAIN = np.array([[1.0], [1.0], [0.1]])  # of a landmark pose's place: depth is seen ten times less well
 LEAST_SEEN = 0.3  # of the points that a frame of the bundle usually sees: with fewer its pose may be anything
-# How far a head is found to turn errs by these standard deviations of its logarithm. The bundle's: shares of its focal
-# length's, as 12 films have it, and as two have it on which hair lies over the forehead; how likely the second is.
-USUAL_TURN, ASTRAY_TURN, ASTRAY = 0.35, 1.25, 0.15
+# How far a head is found to turn errs by these standard deviations of its logarithm. The bundle's is a share of its focal
+# length's.
+BUNDLE_TURN = 0.4
 # The landmarks', and that of their poses (rad), which err in blocks that move with the head, however many there are.
 LANDMARK_TURN, LANDMARK_POSE = 0.06, 0.006
+# Of landmarks led astray, and how likely that is: of a head with hair to the brows they see two thirds of a turn at times.
+ASTRAY_TURN, ASTRAY = 0.4, 0.2
 MOST_TURN = 2.0  # that factor, or its inverse
 LEAST_FOCAL_SD = 0.08  # a focal length that is given leaves open how deep the points lie, too
 ROUNDS, FAR = 8, 2.0  # of telling which frames are far off, in times of what is usual
@@ -42,8 +44,7 @@ def turned_as_far(bundle: Bundle, x: F64, good: Rows, sound: Rows, focal_sd_log:
     """The bundle whose heads turn as far from their mean pose as it and the poses in x [n, P] tell together.
 
     good: [n], frames of x. sound: its rows that are believed. focal_sd_log: of the bundle's focal length. Where
-    the two differ little the bundle mostly knows better; where they differ much it has been led astray. Its points and
-    observations stay as they were.
+    the two differ by more than that allows, landmarks have been led astray. Points and observations stay as they were.
     """
     known = np.isin(bundle.frame, good[sound]) & _well_seen(bundle)
     if known.sum() < MIN_FRAMES:
@@ -74,13 +75,12 @@ def turned_as_far(bundle: Bundle, x: F64, good: Rows, sound: Rows, focal_sd_log:
 def _share(apart: float, certain: float, focal_sd_log: float) -> float:
     """0..1, how far to go from the bundle's to the landmarks' turns, whose logarithms lie `apart`.
 
-    certain: variance of the landmarks'. The expectation over what the bundle may be: as good as usual, or led astray.
+    certain: variance of the landmarks'. The expectation over what these may be: as good as usual, or led astray.
     """
-    own = (np.array([USUAL_TURN, ASTRAY_TURN]) * focal_sd_log) ** 2
-    likely = (
-        np.array([1 - ASTRAY, ASTRAY]) * np.exp(-0.5 * apart**2 / (own + certain)) / np.sqrt(own + certain)
-    )
-    return float((likely * own / (own + certain)).sum() / max(float(likely.sum()), 1e-300))
+    own = (BUNDLE_TURN * focal_sd_log) ** 2
+    whole = own + certain + np.array([0.0, ASTRAY_TURN**2])
+    likely = np.array([1 - ASTRAY, ASTRAY]) * np.exp(-0.5 * apart**2 / whole) / np.sqrt(whole)
+    return float(own * (likely / whole).sum() / max(float(likely.sum()), 1e-300))
 
 
 def hold_poses(

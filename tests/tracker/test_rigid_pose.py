@@ -142,8 +142,8 @@ def turn_deg(bundle: Bundle) -> float:
     ("factor", "focal_sd_log", "low", "high"),
     [
         (0.75, 1.0, 0.9, 1.1),  # nothing is known of the focal length
-        (0.75, 0.15, 0.7, 1.0),  # the bundle must have been led astray
-        (1.3, 0.15, 0.7, 1.0),
+        (0.75, 0.15, 0.0, 0.3),  # landmarks must have been led astray
+        (1.3, 0.15, 0.0, 0.3),
         (0.95, 0.15, 0.15, 0.5),  # either may err by that
         (0.95, 0.0, 0.0, 0.3),  # the focal length is given
     ],
