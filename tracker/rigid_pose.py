@@ -27,12 +27,11 @@ Corrections = list[tuple[F64, F64]]  # times [k] s and corrections [k, 6] of a s
 MIN_FRAMES = 8  # fewer do not tell how the two head frames lie to each other
 CERTAIN = np.array([[1.0], [1.0], [0.1]])  # of a landmark pose's place: depth is seen ten times less well
 LEAST_SEEN = 0.3  # of the points that a frame of the bundle usually sees: with fewer its pose may be anything
-# How far a head is found to turn errs by these standard deviations of its logarithm. The bundle's is a share of its focal
-# length's.
+# Standard deviations of the logarithm of how far a head is found to turn. By the bundle: a share of its focal length's.
 BUNDLE_TURN = 0.4
-# The landmarks', and that of their poses (rad), which err in blocks that move with the head, however many there are.
+# By landmarks, and that of their poses (rad), which err in blocks that move with the head, however many there are.
 LANDMARK_TURN, LANDMARK_POSE = 0.06, 0.006
-# Of landmarks led astray, and how likely that is: of a head with hair to the brows they see two thirds of a turn at times.
+# By landmarks led astray, and how likely these are: of a head with hair to the brows they may see two thirds of a turn.
 ASTRAY_TURN, ASTRAY = 0.4, 0.2
 MOST_TURN = 2.0  # that factor, or its inverse
 LEAST_FOCAL_SD = 0.08  # a focal length that is given leaves open how deep the points lie, too
