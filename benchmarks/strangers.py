@@ -11,13 +11,15 @@ import re
 import numpy as np
 
 from benchmarks.rendered_heads import Colour, Scene
+from tracker.track import F64
 
 UNSEEN = 6
 SIZES = ((640, 640), (1280, 720), (720, 1280))
 DISTANCE_M = (0.35, 1.0)  # of the face: arm's length, a desk, an interview
 DARK, PALE = np.array([0.50, 0.42, 0.38]), np.array([1.05, 1.03, 1.02])  # skin, factors of the painted albedo
 BLACK, FAIR = np.array([0.06, 0.05, 0.05]), np.array([0.60, 0.48, 0.33])  # hair
-BEFORE_FACE = (*4 * ("nothing",), "fringe", "fringe", "glasses", "hand")  # one as likely as another
+# One as likely as another.
+BEFORE_FACE = ("nothing", "nothing", "nothing", "nothing", "fringe", "fringe", "glasses", "hand")
 STUBBLE, SWEEP = 0.3, 0.2  # share of people
 
 
@@ -54,7 +56,7 @@ def drawn(number: int) -> Scene:
     )
 
 
-def _between(one: np.ndarray, other: np.ndarray, random: np.random.Generator) -> Colour:
+def _between(one: F64, other: F64, random: np.random.Generator) -> Colour:
     """A colour somewhere from one to the other."""
     red, green, blue = one + random.random() * (other - one)
     return float(red), float(green), float(blue)
@@ -66,7 +68,8 @@ def number_of(name: str) -> int | None:
     return None if told is None else int(told[1])
 
 
-def strangers(names: set[str]) -> list[Scene]:
-    """The scenes of the strangers among the names of clips; without any names the unseen ones."""
-    numbers = {number for name in names if (number := number_of(name)) is not None}
-    return [drawn(number) for number in sorted(numbers if names else range(1, UNSEEN + 1))]
+def strangers(names: set[str]) -> list[tuple[str, Scene]]:
+    """Group and scene of the strangers among the names of clips; without any names the unseen ones."""
+    unseen = range(1, UNSEEN + 1)
+    numbers = {number for name in names if (number := number_of(name)) is not None} if names else unseen
+    return [("unseen" if number in unseen else "further", drawn(number)) for number in sorted(numbers)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-INSIDE, OUTSIDE = ("person", "inside"), ("own", "unseen", "shared")
+INSIDE, OUTSIDE = ("person", "inside"), ("own", "unseen", "further", "shared")
 ALL, FILMS = (*INSIDE, *OUTSIDE), ("inside", *OUTSIDE)
 TURNS_DEG = 10.0  # a head that turns less from its mean leaves the focal length undecided
 GAIN = 0.3

@@ -7,7 +7,7 @@ unseen    six such films drawn by lot (benchmarks/strangers.py), by which no met
 shared    rendered scan heads of the shared data ($PERSONALIZE_SHARED), where it is at hand
 
 Films go through the pipeline's own stages: usable frames, landmarks, camera, fit. NAMEs (`hand`, `person1`) choose
-clips; `stranger101` and up draw further ones, by which methods may be chosen; for a VIDEO only consistency can be
+clips; `stranger101` and up draw `further` ones, by which methods may be chosen; for a VIDEO only consistency can be
 told. At the end: the numbers wanted, and whether they are reached, in all and by group.
 
 surf, mean      distance of the neutral face from the true surface after one similarity; of the mean head's, mm
@@ -161,7 +161,7 @@ def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str,
             yield "person", f"person{seed}", only_landmarks(landmarks, truth.focal), truth
     made = [
         *(("own" if scene.bend_mm else "inside", scene) for scene in SCENES if wanted(scene.name, chosen)),
-        *(("unseen", scene) for scene in strangers(chosen)),
+        *strangers(chosen),
     ]
     for group, scene in made:
         video, truth = film(scene, head)
