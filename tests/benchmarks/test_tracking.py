@@ -20,6 +20,15 @@ def test_one_clip_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     assert any(line.startswith("frames with bare lips lost") and line.endswith("yes") for line in bars)
 
 
+def test_any_stranger_may_be_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[set[str]] = []
+    monkeypatch.setattr(tracking, "compile_ahead", lambda head: None)
+    monkeypatch.setattr(tracking, "ground_truths", lambda head, chosen: asked.append(chosen) or iter(()))
+    monkeypatch.setattr(sys, "argv", ["tracking", "stranger1234"])
+    tracking.main()
+    assert asked == [{"stranger1234"}]
+
+
 def test_unknown_clip_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["tracking", "nobody"])
     with pytest.raises(SystemExit) as stopped:
