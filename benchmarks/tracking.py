@@ -8,7 +8,8 @@ shared    rendered scan heads of the shared data ($PERSONALIZE_SHARED), where it
 
 Films go through the pipeline's own stages: usable frames, landmarks, camera, fit. NAMEs (`hand`, `person1`) choose
 clips; `stranger101` and up draw `further` ones, by which methods may be chosen; for a VIDEO only consistency can be
-told. At the end: the numbers wanted, and whether they are reached, in all and by group.
+told. With --lens every camera wrote its focal length down, as far off as the tracker expects of telephones.
+At the end: the numbers wanted, and whether they are reached, in all and by group.
 
 surf, mean      distance of the neutral face from the true surface after one similarity; of the mean head's, mm
 face, rigid     face vertices, neutral and motion, after one similarity a clip and after one rigid transform, mm
@@ -32,6 +33,7 @@ import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +50,7 @@ from benchmarks.track_errors import compare
 from personalize.container import probe
 from personalize.ingest import find_usable
 from personalize.pictures import read_frames
-from tracker.camera import estimate_camera
+from tracker.camera import FILM_MM, MIDDLE, MIDDLE_SD_LOG, estimate_camera
 from tracker.confidence import bare, judge
 from tracker.feature_tracks import FeatureFollower
 from tracker.fit import fit_track
@@ -131,18 +133,29 @@ def judged(track: Track, clip: Clip, deviation: F32 | None = None) -> Track:
     return track if clip.appearance is None else judge(track, clip.appearance, deviation)[0]
 
 
-def watched(video: Path, head: HeadModel) -> Clip:
-    """Usable frames, landmarks and camera of a film, as the pipeline finds them."""
+def watched(video: Path, head: HeadModel, recorded_mm: float = 0.0) -> Clip:
+    """Usable frames, landmarks and camera of a film, as the pipeline finds them.
+
+    recorded_mm: in the place of what the file tells of the lens, see `estimate_camera`.
+    """
     start = clock()
-    frames, _ = find_usable(probe(video))
+    info = probe(video)
+    frames, _ = find_usable(info)
     cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
     watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment, frames.box)
     watchers = (watch, follower)
     landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box, watchers=watchers)
     appearance = watch.appearance(frames.usable)
-    camera, bundle = estimate_camera(landmarks, follower.tracks(), head)
+    recorded_mm = recorded_mm or info.focal_mm
+    camera, bundle = estimate_camera(landmarks, follower.tracks(), head, recorded_mm=recorded_mm)
     spent = (clock() - start) / len(frames.time)
     return Clip(landmarks, camera, bundle, frames.usable, frames.segment, appearance, video, spent)
+
+
+def written_lens(truth: GroundTruth, size: tuple[int, int], name: str) -> float:
+    """mm on film 36 mm wide: what the camera of a clip might have written of its lens."""
+    off = MIDDLE_SD_LOG * float(np.random.default_rng(list(name.encode())).standard_normal())
+    return truth.focal / max(size) * FILM_MM / MIDDLE * float(np.exp(off))
 
 
 def only_landmarks(landmarks: Landmarks, focal: float) -> Clip:
@@ -153,8 +166,10 @@ def only_landmarks(landmarks: Landmarks, focal: float) -> Clip:
     return Clip(landmarks, camera, NO_BUNDLE, everywhere, one_shot, None, None, np.zeros(2))
 
 
-def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str, Clip, GroundTruth]]:
-    """(group, name, clip, truth) of every clip, or of the chosen ones."""
+def ground_truths(
+    head: HeadModel, chosen: set[str], lens: bool = False
+) -> Iterator[tuple[str, str, Clip, GroundTruth]]:
+    """(group, name, clip, truth) of every clip, or of the chosen ones. lens: whether cameras wrote theirs down."""
     for seed in range(PERSONS):
         if wanted(f"person{seed}", chosen):
             truth, landmarks = noisy_landmarks(head, PERSON_FRAMES, seed)
@@ -163,12 +178,16 @@ def ground_truths(head: HeadModel, chosen: set[str]) -> Iterator[tuple[str, str,
         *(("own" if scene.bend_mm else "inside", scene) for scene in SCENES if wanted(scene.name, chosen)),
         *strangers(chosen),
     ]
-    for group, scene in made:
-        video, truth = film(scene, head)
-        yield group, scene.name, watched(video, head), truth
-    for path in scan_heads():
-        if wanted(path.stem, chosen):
-            yield "shared", path.stem, watched(path.with_suffix(".mp4"), head), GroundTruth.load(path)
+    films = ((group, scene.name, *film(scene, head)) for group, scene in made)
+    scans = (
+        ("shared", path.stem, path.with_suffix(".mp4"), GroundTruth.load(path))
+        for path in scan_heads()
+        if wanted(path.stem, chosen)
+    )
+    for group, name, video, truth in chain(films, scans):
+        info = probe(video)
+        mm = written_lens(truth, (info.width, info.height), name) if lens else 0.0
+        yield group, name, watched(video, head, mm), truth
 
 
 def compile_ahead(head: HeadModel) -> None:
@@ -220,7 +239,9 @@ def main() -> None:
     """Print the table, and the numbers wanted."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("clips", nargs="*", metavar="NAME | VIDEO")
-    named = parser.parse_args().clips
+    parser.add_argument("--lens", action="store_true", help="cameras wrote their focal lengths down")
+    options = parser.parse_args()
+    named = options.clips
     videos = [Path(name) for name in named if Path(name).suffix]
     chosen = {name for name in named if not Path(name).suffix}
     if unknown := {name for name in chosen - set(known_names()) if number_of(name) is None}:
@@ -234,7 +255,7 @@ def main() -> None:
         print(
             f"{'clip':16s} {'stage':10s}", *(f"{name:>{max(6, len(name) + 1)}}" for name in COLUMNS), sep=""
         )
-        for group, name, clip, truth in ground_truths(head, chosen):
+        for group, name, clip, truth in ground_truths(head, chosen, options.lens):
             for stage, track, spent in stages(clip, head):
                 errors = compare(track, head, truth) | spent
                 rows.append(Row(group, name, stage, errors))

@@ -14,6 +14,7 @@ from av.sidedata.sidedata import Type as SideData
 from numpy.typing import NDArray
 
 from personalize.errors import UserError
+from personalize.recorded_lens import recorded_focal_mm
 
 MAX_DURATION_S = 4 * 3600.0
 MATROSKA = "matroska,webm"
@@ -28,7 +29,8 @@ class MediaInfo:
     width, height: px of the upright picture with square pixels. rotation_deg: counter-clockwise turn that the
     file asks for. fps: nominal rate. duration_s: as the container states it, 0 when it does not.
     video_start_s: presentation time of the first picture on the container's clock.
-    audio_rate (Hz), audio_channels: 0 without sound.
+    audio_rate (Hz), audio_channels: 0 without sound. focal_mm: what the camera wrote of its lens, on film 36 mm wide;
+    0 where it wrote nothing.
     """
 
     path: str
@@ -46,6 +48,7 @@ class MediaInfo:
     audio_codec: str
     audio_rate: int
     audio_channels: int
+    focal_mm: float
 
     def as_json(self) -> dict[str, Any]:
         """Plain dictionary for media.json."""
@@ -171,6 +174,7 @@ def probe(path: Path | str) -> MediaInfo:
             audio_codec=audio.codec_context.name if audio else "",
             audio_rate=audio.rate if audio else 0,
             audio_channels=audio.channels if audio else 0,
+            focal_mm=recorded_focal_mm(path) if "mov" in source.container.format.name.split(",") else 0.0,
         )
 
 

@@ -26,6 +26,9 @@ from personalize.errors import UserError
 
 LARGEST_PICKLE_BYTES = 2 << 30
 LARGEST_SPARSE_BYTES = 256 << 20  # of a sparse matrix made dense in double precision
+LARGEST_TUPLE = (
+    1 << 16
+)  # members and members of members, as often as they are met: as a key's hash meets them
 DTYPE = re.compile(r"[<>|=]?[biufcSU]\d{1,6}")
 # What a damaged or hostile file makes the interpreter of pickles, or the building after it, raise.
 BROKEN = (
@@ -153,6 +156,16 @@ def build_pickle(path: Path, content: bytes) -> dict[Any, Any]:
     return value
 
 
+def _weighing(load: Any) -> Any:
+    """An opcode that leaves a tuple on the stack, and has it weighed."""
+
+    def loaded(unpickler: Any) -> None:
+        load(unpickler)
+        unpickler.weigh(unpickler.stack[-1])
+
+    return loaded
+
+
 class _Unpickler(pickle._Unpickler):
     """Finds holders, and nothing else.
 
@@ -167,6 +180,8 @@ class _Unpickler(pickle._Unpickler):
     def __init__(self, path: Path, content: bytes) -> None:
         super().__init__(io.BytesIO(content), encoding="latin1")
         self._path = path
+        # Of tuples that hold tuples: by id, how many members all in all, and the tuple, which keeps its id its own.
+        self._weights: dict[int, tuple[int, Any]] = {}
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in HOLDERS:
@@ -183,7 +198,20 @@ class _Unpickler(pickle._Unpickler):
             raise EOFError(f"{length} bytes announced, {len(content)} there")
         self.append(bytearray(content))
 
+    def weigh(self, made: tuple[Any, ...]) -> None:
+        """Refuse a tuple of tuples of tuples .., a few bytes each, that takes for ever to be hashed as a key."""
+        if not any(isinstance(member, tuple) for member in made):
+            return
+        weight = len(made) + sum(
+            self._weights.get(id(member), (len(member),))[0] for member in made if isinstance(member, tuple)
+        )
+        if weight > LARGEST_TUPLE:
+            raise ValueError("tuples nested too deep")
+        self._weights[id(made)] = weight, made
+
     dispatch: ClassVar[Any] = pickle._Unpickler.dispatch | {pickle.BYTEARRAY8[0]: load_bytearray}
+    for _code in (pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3):
+        dispatch[_code[0]] = _weighing(dispatch[_code[0]])
 
 
 class _Builder:

@@ -52,7 +52,7 @@ def speech_model_assets(settings: Settings) -> dict[str, str]:
 class Ingest(Stage):
     """Video -> times, usable frames and why not, sound, split."""
 
-    name, version, needs = "ingest", 5, (VIDEO,)
+    name, version, needs = "ingest", 6, (VIDEO,)
     makes = ("media.json", "frames.npz", "audio.wav", "split.json")
 
     def make(self, context: Context, folder: Path) -> None:
@@ -97,8 +97,8 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 10, ("focal_px", "distortion")
-    needs = ("landmarks/landmarks.npz", "landmarks/features.npz")
+    name, version, reads = "camera", 11, ("focal_px", "distortion")
+    needs = ("ingest/media.json", "landmarks/landmarks.npz", "landmarks/features.npz")
     makes = ("camera.json", "bundle.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -112,6 +112,7 @@ class CameraStage(Stage):
             run_head(context.settings),
             focal_given=context.settings.focal_px,
             distortion=context.settings.distortion,
+            recorded_mm=context.run.read_json("ingest/media.json")["focal_mm"],
             progress=context.report.progress,
         )
         files.write_camera(folder, camera, bundle)

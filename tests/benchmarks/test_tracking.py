@@ -23,7 +23,9 @@ def test_one_clip_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 def test_any_stranger_may_be_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[set[str]] = []
     monkeypatch.setattr(tracking, "compile_ahead", lambda head: None)
-    monkeypatch.setattr(tracking, "ground_truths", lambda head, chosen: asked.append(chosen) or iter(()))
+    monkeypatch.setattr(
+        tracking, "ground_truths", lambda head, chosen, lens: asked.append(chosen) or iter(())
+    )
     monkeypatch.setattr(sys, "argv", ["tracking", "stranger1234"])
     tracking.main()
     assert asked == [{"stranger1234"}]

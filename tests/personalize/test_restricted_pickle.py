@@ -221,6 +221,22 @@ def test_a_memo_place_costs_nothing(tmp_path: Path) -> None:
     assert read_pickle(written(tmp_path, b"\x80\x02}r\xff\xff\xff\x7f.")) == {}
 
 
+@pytest.mark.parametrize("holder", ["key", "member"])
+def test_tuples_of_tuples_are_refused_before_they_are_hashed(tmp_path: Path, holder: str) -> None:
+    nested: Any = (1, 2)
+    for _ in range(200):  # 2^200 members, in 2 kB
+        nested = (nested, nested)
+    chain = pickle.dumps(nested, protocol=2)[:-1]
+    content = (
+        chain
+        + (pickle.NONE + pickle.SETITEM if holder == "key" else pickle.TUPLE1 + pickle.APPEND)
+        + pickle.STOP
+    )
+    start = pickle.PROTO + b"\x02" + (pickle.EMPTY_DICT if holder == "key" else pickle.EMPTY_LIST)
+    with pytest.raises(UserError, match="tuples nested too deep"):
+        read_pickle(written(tmp_path, start + content[2:]))
+
+
 def test_indices_out_of_range_are_found(tmp_path: Path) -> None:
     matrix = sparse.csr_matrix(np.eye(3))
     matrix.indices[1] = 77

@@ -11,14 +11,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import pytest
 
 from personalize.errors import UserError
 from personalize.reporter import Reporter
-from personalize.run import RunFolder
+from personalize.run import RunFolder, read_camera, write_features, write_landmarks
 from personalize.settings import Settings
 from personalize.stage import Context, Stage, is_cached, run_stages
-from personalize.stages import Ingest
+from personalize.stages import CameraStage, Ingest
+from tracker.feature_tracks import FeatureTracks
+from tracker.track import Landmarks
 
 
 class Count(Stage):
@@ -220,3 +223,22 @@ def test_another_videos_folder_is_refused(context: Context, tmp_path: Path) -> N
     assert (context.run.path / "run.json").read_bytes() == before
     with pytest.raises(UserError, match="not a run folder"):
         RunFolder.create(tmp_path, other)
+
+
+def test_the_camera_believes_what_the_file_tells_of_the_lens(context: Context) -> None:
+    root = context.run.path
+    (root / "ingest").mkdir()
+    (root / "ingest/media.json").write_text(json.dumps({"focal_mm": 27.0}))
+    (root / "landmarks").mkdir()
+    points = np.full((3, 478, 3), np.nan, np.float32)
+    landmarks = Landmarks(
+        *(np.arange(3) / 25, points, np.zeros((3, 52), np.float32), np.zeros(3, np.float32)),
+        blendshape_names=("",) * 52,
+        size=(640, 480),
+    )
+    write_landmarks(root / "landmarks/landmarks.npz", landmarks)
+    nothing = FeatureTracks(np.zeros(0, np.int32), np.zeros((0, 4), np.float32))
+    write_features(root / "landmarks/features.npz", nothing)
+    run_stages([CameraStage()], context)
+    camera, _ = read_camera(root / "camera")
+    assert camera.focal_px == pytest.approx(1.1 * 27 / 36 * 640) and "27 mm" in camera.prior
