@@ -32,7 +32,7 @@ def measure(path: Path, head: HeadModel) -> tuple[Camera, Bundle, float]:
     frames, _ = find_usable(info)
     cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
     follower = FeatureFollower(frames.time, frames.usable, frames.segment, frames.box)
-    landmarks = track_landmarks(read_frames(path), len(frames.time), cuts, watchers=(follower,))
+    landmarks = track_landmarks(read_frames(path), len(frames.time), cuts, frames.box, watchers=(follower,))
     start = time.perf_counter()
     camera, bundle = estimate_camera(landmarks, follower.tracks(), head, recorded_mm=info.focal_mm)
     return camera, bundle, time.perf_counter() - start

@@ -12,7 +12,7 @@ ALL, FILMS = (*INSIDE, *OUTSIDE), ("inside", *OUTSIDE)
 TURNS_DEG = 10.0  # a head that turns less from its mean leaves the focal length undecided
 GAIN = 0.3
 PHOTOMETRIC = ("opening_centred_mm", "rotation_deg", "jitter_mm")
-# A face that stands still has next to none of these and would only lower their means.
+# A face that stands still has next to none of these, and would lower their means or, by nothing, be called worse.
 OF_MOTION = (
     *("lip_motion_mm", "lip_in_plane_mm", "lip_neutral_mm"),
     *("opening_rmse_mm", "opening_centred_mm", "rotation_deg"),
@@ -72,7 +72,7 @@ BARS = (
     Bar("in model: opening r", INSIDE, "opening_r", 0.995, at_least=True),
     Bar("in model: opening RMSE, mm", INSIDE, "opening_rmse_mm", 0.4),
     Bar("in model: rotation, degrees", INSIDE, "rotation_deg", 0.7),
-    Bar("in model: focal of turning heads, %", INSIDE, "turning_focal_pct", 10.0, worst=True),
+    Bar("in model: focal of turning heads, %", ("inside",), "turning_focal_pct", 10.0, worst=True),
     Bar("out of model: opening r", OUTSIDE, "opening_r", 0.99, at_least=True),
     Bar("out of model: opening RMSE, mm", OUTSIDE, "opening_rmse_mm", 0.5),
     Bar("out of model: opening RMSE about its mean, mm", OUTSIDE, "opening_centred_mm", 0.3),
@@ -128,7 +128,8 @@ def _print_gain(rows: list[Row], error: str, say: Callable[[str], None]) -> None
     """By how much the last stage lowers an error, and on which clips it raises it."""
     first = {row.clip: row for row in reversed(rows)}
     pairs = [(row, first[row.clip]) for row in last_stages(rows) if row.stage != first[row.clip].stage]
-    after, before = (np.array([pair[k].errors[error] for pair in pairs]) for k in (0, 1))
+    pairs = [pair for pair in pairs if np.isfinite(figure(pair[0], error))]
+    after, before = (np.array([figure(pair[k], error) for pair in pairs]) for k in (0, 1))
     if not len(pairs):
         return
     gain = 1 - after.mean() / before.mean()

@@ -7,6 +7,7 @@ points where the meshes differ, by their vertices where they are the same mesh. 
 from __future__ import annotations
 
 import numpy as np
+import trimesh
 from kornia.geometry import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, minimum_filter1d
@@ -49,7 +50,6 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
     errors = {"surface_mm": surface, "mean_surface_mm": surface_error(mean, head, truth)[0]}
     if truth.vertices is not None:
         errors |= face_errors(neutral, track, fitted, judged, head, truth)
-        frame = similarity(neutral[truth.vertices], truth.neutral)
     errors |= lip_errors(neutral, frame, track, judged, head, truth)
     errors |= opening_errors(track.lip_gap_mm.astype(np.float64) * frame[0], truth.lip_gap_mm, judged)
     return errors | {
@@ -63,11 +63,15 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
 
 def surface_error(neutral: F64, head: HeadModel, truth: GroundTruth) -> tuple[float, Similarity]:
     """Mean distance of the face of a neutral [D, 3] m from the true surface, mm, after the similarity given with it."""
-    face = head.regions["face"]
-    scale, turned, shift = _align(neutral[face], truth)
-    distance, _ = cKDTree(truth.neutral).query(scale * neutral[face] @ turned.T + shift)
-    near = distance < np.quantile(distance, 0.95)  # the two heads do not end at the same rim
-    return 1e3 * float(distance[near].mean()), (scale, turned, shift)
+    face = neutral[head.regions["face"]]
+    if truth.vertices is None:
+        frame = _align(face, truth)
+    else:
+        frame = similarity(neutral[truth.vertices], truth.neutral)
+    scale, turned, shift = frame
+    surface = trimesh.Trimesh(truth.neutral, truth.faces, process=False)
+    _, distance, _ = trimesh.proximity.closest_point(surface, scale * face @ turned.T + shift)
+    return 1e3 * float(distance.mean()), frame
 
 
 def face_errors(

@@ -8,7 +8,7 @@ shared    rendered scan heads of the shared data ($PERSONALIZE_SHARED), where it
 
 Films go through the pipeline's own stages: usable frames, landmarks, camera, fit. NAMEs (`hand`, `person1`) choose
 clips; `stranger101` and up draw `further` ones, by which methods may be chosen; for a VIDEO only consistency can be
-told. With --lens every camera wrote its focal length down, as far off as the tracker expects of telephones.
+told. With --lens every camera wrote its focal length down, as far off as the tracker takes it to be.
 At the end: the numbers wanted, and whether they are reached, in all and by group.
 
 surf, mean      distance of the neutral face from the true surface after one similarity; of the mean head's, mm
@@ -152,10 +152,11 @@ def watched(video: Path, head: HeadModel, recorded_mm: float = 0.0) -> Clip:
     return Clip(landmarks, camera, bundle, frames.usable, frames.segment, appearance, video, spent)
 
 
-def written_lens(truth: GroundTruth, size: tuple[int, int], name: str) -> float:
-    """mm on film 36 mm wide: what the camera of a clip might have written of its lens."""
-    off = MIDDLE_SD_LOG * float(np.random.default_rng(list(name.encode())).standard_normal())
-    return truth.focal / max(size) * FILM_MM / MIDDLE * float(np.exp(off))
+def written_lens(truth: GroundTruth, video: Path, name: str) -> float:
+    """mm on film 36 mm wide: what the camera of a clip might have written of its lens, too long or too short."""
+    info = probe(video)
+    off = MIDDLE_SD_LOG * (-1) ** sum(name.encode())
+    return truth.focal / max(info.width, info.height) * FILM_MM / MIDDLE * float(np.exp(off))
 
 
 def only_landmarks(landmarks: Landmarks, focal: float) -> Clip:
@@ -185,9 +186,7 @@ def ground_truths(
         if wanted(path.stem, chosen)
     )
     for group, name, video, truth in chain(films, scans):
-        info = probe(video)
-        mm = written_lens(truth, (info.width, info.height), name) if lens else 0.0
-        yield group, name, watched(video, head, mm), truth
+        yield group, name, watched(video, head, written_lens(truth, video, name) if lens else 0.0), truth
 
 
 def compile_ahead(head: HeadModel) -> None:

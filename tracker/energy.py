@@ -307,7 +307,7 @@ class Energy:
         return np.minimum(height - model.touch, 0.0) * (1e3 / self.weights.contact_mm)
 
     def _prior(self, x: F64) -> tuple[F64, F64, F64]:
-        """Prior of the expression weights: value [n], gradient and curvature [n, Ke]."""
+        """Prior of the expression weights: value [n], gradient and curvature [n, K]."""
         w = x[:, :-POSE]
         rate = self.strictness[:, None] * self.model.modes.rate
         curve = self.strictness[:, None] * self.model.modes.precision

@@ -63,7 +63,7 @@ def fit_track(
     model = landmark_model(head, weights)
     good = _measurable(landmarks, model, usable)
     observed = camera.lens.points(landmarks.points[good][..., :2])
-    energy, start = _start(model, weights, camera, observed, landmarks.points[good])
+    energy, start = _start(model, weights, camera, observed, landmarks.points[good, :, 2])
     share, sound = _share(evidence, good), trusted(evidence, good)
     keys = key_frames(observed[sound], energy.px_per_m[sound]).of(sound)
     energy = with_lips_shut(energy, start, keys.rest)
@@ -97,10 +97,10 @@ def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.b
 
 
 def _start(
-    model: LandmarkModel, weights: Weights, camera: Camera, observed: F64, points: NDArray[np.floating]
+    model: LandmarkModel, weights: Weights, camera: Camera, observed: F64, depth: NDArray[np.floating]
 ) -> tuple[Energy, F64]:
-    """The clip's energy, and poses of the mean head by Procrustes against the landmarker's own depth."""
-    seen = points[:, model.landmarks].astype(np.float64)
+    """The clip's energy, and poses of the mean head by Procrustes against the landmarker's own depth [n, 478] px."""
+    seen = np.concatenate([observed, depth[..., None]], axis=2)[:, model.landmarks]
     centre = seen.mean(1, keepdims=True)
     covariance = (seen - centre).transpose(0, 2, 1) @ model.mean
     u, size, vt = np.linalg.svd(covariance)

@@ -32,7 +32,7 @@ def regions_of(
     """Name -> vertex indices, HeadModel's names. Raises TrackError without inner lips, and for wrong masks."""
     at = np.einsum("lc,lcx->lx", embedding.barycentric, template[faces[embedding.triangles]])
     point = {int(index): at[row] for row, index in enumerate(embedding.landmarks)}
-    upper, lower = inner_lips(template, faces, embedding)
+    upper, lower = inner_lips(faces, embedding)
     balls = [np.flatnonzero(skeleton.weights[:, row] > 0.5) for row in (LEFT_EYE_JOINT, RIGHT_EYE_JOINT)]
     eyes = np.concatenate(balls)
     skin = np.setdiff1d(np.arange(len(template)), eyes)
@@ -56,7 +56,7 @@ def regions_of(
     return {name: vertices.astype(np.int32) for name, vertices in regions.items()}
 
 
-def inner_lips(template: F64, faces: I32, embedding: LandmarkEmbedding) -> tuple[I32, I32]:
+def inner_lips(faces: I32, embedding: LandmarkEmbedding) -> tuple[I32, I32]:
     """Vertices of the inner lips from the right corner to the left one, upper and lower paired."""
     row = {int(index): i for i, index in enumerate(embedding.landmarks)}
     pairs = [pair for pair in zip(INNER_LIP_UPPER, INNER_LIP_LOWER, strict=True) if row.keys() >= set(pair)]

@@ -23,33 +23,47 @@ def eye_rotations(
     """[n, 2, 3] rad, left then right: the turn that carries the head's straight iris onto the seen one.
 
     The head's own eyeballs turn: the embedded head's have a radius of 16.6 mm, real ones 12, and turn less for it.
-    observed: [n, 478, 2] px. Yaw turns about y and pitch about x of the head; no roll. Zero if the head's
-    landmark embedding has no irises. That the eyes differ in the clip's median is the head's error rather than a
-    squint: both take the mean of their medians.
+    observed: [n, 478, 2] px. The iris lies where the ray through it enters the eyeball; eyes do not roll, nor
+    turn by more than LIMIT. Zero if the head's landmark embedding has no irises. That the eyes differ in the
+    clip's median is the head's error rather than a squint: both take the mean of their medians.
     """
     at = [np.flatnonzero(head.landmark_embedding.landmarks == index) for index in IRIS_CENTRES]
-    out = np.zeros((len(x), 2, 3))
     if any(len(index) != 1 for index in at):
-        return out
+        return np.zeros((len(x), 2, 3))
     rows = np.concatenate(at)
-    straight = _embedded(head, rows, identity, expression) - energy.model.centre
+    straight = _from_eyeballs(head, rows, identity)
     matrix = rotation_matrix(x[:, -6:-3])
-    camera = straight @ matrix.transpose(0, 2, 1) + x[:, None, -3:]
-    expected = energy.focal * camera[..., :2] / camera[..., 2:] + energy.principal
-    shift = np.zeros((len(x), 2, 3))
-    shift[..., :2] = (observed[:, IRIS_CENTRES] - expected) * camera[..., 2:] / energy.focal
-    moved = shift @ matrix / _radii(head, rows, identity)[:, None]  # back to head axes
-    out[..., 1] = np.arcsin(np.clip(moved[..., 0], -np.sin(LIMIT), np.sin(LIMIT)))
-    out[..., 0] = -np.arcsin(np.clip(moved[..., 1], -np.sin(LIMIT), np.sin(LIMIT)))
+    rays = np.ones((len(x), 2, 3))
+    rays[..., :2] = (observed[:, IRIS_CENTRES] - energy.principal) / energy.focal
+    # In head axes, from the camera.
+    rays = rays @ matrix / np.linalg.norm(rays, axis=-1, keepdims=True)
+    eyeballs = _embedded(head, rows, identity, expression) - energy.model.centre - straight
+    eyeballs += x[:, None, -3:] @ matrix
+    along = (eyeballs * rays).sum(-1)
+    inside = (straight**2).sum(-1) - (eyeballs**2).sum(-1) + along**2
+    seen = (along - np.sqrt(np.maximum(inside, 0)))[..., None] * rays - eyeballs
+    out = _turns(straight, seen)
     return out - np.median(out, axis=0) + np.median(out, axis=0).mean(0)
 
 
-def _radii(head: HeadModel, rows: NDArray[np.int64], identity: F64) -> F64:
-    """[2] m from the centre of each eyeball to the middle of its iris."""
+def _turns(start: F64, end: F64) -> F64:
+    """[n, 2, 3] rad, the turns about axes across z that take the directions start [2, 3] to end [n, 2, 3]."""
+    start, end = (towards / np.linalg.norm(towards, axis=-1, keepdims=True) for towards in (start, end))
+    # A turn moves along circles about its axis, which is therefore square to where it moves something.
+    axis = np.cross([0.0, 0.0, 1.0], end - start)
+    axis /= np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), 1e-12)
+    across = start - (start * axis).sum(-1, keepdims=True) * axis
+    sine = (np.cross(across, end) * axis).sum(-1, keepdims=True)
+    angle = np.arctan2(sine, (across * end).sum(-1, keepdims=True))
+    return np.clip(angle, -LIMIT, LIMIT) * axis
+
+
+def _from_eyeballs(head: HeadModel, rows: NDArray[np.int64], identity: F64) -> F64:
+    """[2, 3] m from the centre of each eyeball to the middle of its iris, the eyes straight."""
     iris = _embedded(head, rows, identity, np.zeros((1, len(head.expression_basis)), np.float32))[0]
     joints = [head.joints[name] for name in ("left_eye", "right_eye")]
     centre = np.stack([joint.position + identity @ joint.identity_basis for joint in joints])
-    return np.linalg.norm(iris - centre, axis=1)
+    return iris - centre
 
 
 def _embedded(

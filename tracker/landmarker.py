@@ -31,14 +31,14 @@ from tracker.landmark_indices import (
     RIGHT_EYE_OUTER,
 )
 from tracker.networks import open_network
-from tracker.track import F32, Landmarks
+from tracker.track import F32, STEP_S, Landmarks
 
 INPUT_SIZE = 256  # px, side of the landmark network's square input
 MARGIN = 1.5  # side of the region over the long side of the face's box
 MIN_PRESENCE = 0.5  # below, the face counts as lost
 SEARCH_INTERVAL = 10  # frames between searches in tiles while no face is found: each is dozens of detections
-# Share of the new frame's region in the smoothed one. The points follow the face within the region, so that a
-# region that lags costs nothing, while one that jumps adds jitter.
+# Share of the new frame's region in the smoothed one, STEP_S after the last. A region that jumps adds jitter, one that
+# lags costs up to .5 px where a face crosses its own width in a second.
 SMOOTHING = 0.35
 
 
@@ -195,10 +195,12 @@ class LandmarkTracker:
         self._roi = None
         self._frames_without = 0
 
-    def next(self, rgb: NDArray[np.uint8], box: F32 | None = None) -> tuple[F32, float, F32] | None:
+    def next(
+        self, rgb: NDArray[np.uint8], box: F32 | None = None, step_s: float = STEP_S
+    ) -> tuple[F32, float, F32] | None:
         """Landmarks, presence and blendshapes (as `FaceLandmarker.landmarks`) of the next frame, or None.
 
-        box: [4] left, top, right, bottom px of the face that is meant, where it is known.
+        box: [4] left, top, right, bottom px of the face that is meant, where it is known. step_s: since the last one.
         """
         if (
             self._roi is not None
@@ -209,7 +211,8 @@ class LandmarkTracker:
         if self._roi is not None:
             found = self._landmarker.landmarks(rgb, self._roi)
             if found[1] >= MIN_PRESENCE:
-                self._roi = self._roi.blend(roi_from_points(found[0]), SMOOTHING)
+                share = 1 - (1 - SMOOTHING) ** (step_s / STEP_S)
+                self._roi = self._roi.blend(roi_from_points(found[0]), share)
                 return found
         return self._search(rgb, box)
 
@@ -267,9 +270,10 @@ def track_landmarks(
     for index, (time, rgb) in enumerate(frames):
         if cuts is not None and index in cuts:
             tracker.reset()
+        step_s = time - times[-1] if times else STEP_S
         times.append(time)
         box = None if boxes is None or np.isnan(boxes[index]).any() else boxes[index]
-        rows.append(tracker.next(rgb, box) or nothing)
+        rows.append(tracker.next(rgb, box, step_s) or nothing)
         size = (rgb.shape[1], rgb.shape[0])
         for watcher in watchers:
             watcher.see(rgb, rows[-1][0])

@@ -28,8 +28,9 @@ LEAST_BLUR_PX = 0.5
 class LipLines:
     """Lines across the mouth of n frames, one through each of the Q pairs of inner-lip landmarks, down the face.
 
-    middle: [n, Q, 2] px, between the pair. step: [n, 2] px per mm on the face. marks: [n, Q, 4] mm along the line:
-    outer upper, inner upper, inner lower and outer lower edge by the landmarks.
+    middle: [n, Q, 2] px, between the pair. step: [n, 2] px per mm at the face's distance, in the picture's plane: a
+    face that nods shows fewer of its own. marks: [n, Q, 4] such mm along the line: outer upper, inner upper, inner
+    lower and outer lower edge by the landmarks.
     """
 
     middle: F64

@@ -226,6 +226,7 @@ def _stretches(
 def _relative(deviation: F64, good: Index, total: int) -> F32:
     """[T, 2] times the median, of deviations [n, 2] of the frames `good`."""
     out = np.full((total, 2), np.nan, np.float32)
-    if np.isfinite(deviation).any():
-        out[good] = deviation / np.maximum(np.nanmedian(deviation, axis=0), 1e-9)
+    for column, values in enumerate(deviation.T):
+        if (known := np.isfinite(values)).any():
+            out[good, column] = values / max(float(np.median(values[known])), 1e-9)
     return out

@@ -39,8 +39,8 @@ class Photometry:
     prior: float = 2.0
     """Factor on the landmark fit's expression prior: more evidence needs more holding of what it cannot tell."""
     pair_noise_mm: float = 0.04
-    """Standard deviation of an opening between landmarks that the colours moved: real lips roll, wet and fold as no
-    albedo tells.
+    """Standard deviation of an opening between lips, or lids, from what the landmarks (of lips: moved by the colours)
+    have: real lips roll, wet and fold as no albedo tells.
 
     At 1 the skin opened lips by 1 to 3 mm on real clips that the eye sees shut, at .2 some by 1.5.
     """
@@ -232,7 +232,9 @@ def _expected(grey: F32, level: Level, basis: F32, seen: F32) -> F32:
 
 
 def deviation(energy: PhotometricEnergy, x: F64) -> F64:
-    """[n, 2] mean absolute deviation of the grey levels seen, in their sd, of all points and of the mouth's."""
+    """[n, 2] mean absolute deviation of the grey levels seen, in sd: of all points and the mouth's, NaN of none."""
     error = np.minimum(np.abs(energy.grey(x) - energy.expected) / energy.noise, FARTHEST)
     parts = np.stack([energy.seen, energy.seen * energy.skin.mouth])
-    return ((parts * error).sum(2) / np.maximum(parts.sum(2), 1e-9)).T.astype(np.float64)
+    count = parts.sum(2)
+    mean = (parts * error).sum(2) / np.maximum(count, 1e-9)
+    return np.where(count > 0, mean, np.nan).T.astype(np.float64)

@@ -123,7 +123,7 @@ class SubjectEnergy:
 def fit_identity_to_skin(subject: Subject, cuts: Mapping[int, U8], keys: KeyFrames, x: F64) -> F64:
     """Identity [Ki] from key frames at their landmark fit x [n, U]; the subject's where that brings the skin no nearer.
 
-    cuts: the faces of those that there are, by rows.
+    What poses and expressions gain meanwhile counts for the new one. cuts: the faces of those that there are, by rows.
     """
     keys = keys.among(np.array(list(cuts)))
     rows = keys.rows

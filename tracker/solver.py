@@ -148,7 +148,7 @@ def solve_subject(
             if trial_value < value or damping > GIVE_UP:
                 break
             damping *= 10
-        if trial_value >= value:
+        if not trial_value < value:
             break
         gain, value = value - trial_value, trial_value
         identity, x, damping, done = trial_identity, trial, max(damping / 5, 1e-6), done + 1
@@ -321,7 +321,7 @@ def _solve_part(
                 break
             damping *= 10
         progress(step + 1, steps)
-        if trial_value >= value:
+        if not trial_value < value:
             break
         gain, value, x, damping = value - trial_value, trial_value, trial, max(damping / 5, 1e-6)
         if gain < tolerance * value:

@@ -12,7 +12,7 @@ from tracker.lens import Lens
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-STEP_S = 0.04  # from frame to frame, for which weights and errors are told; those of other rates follow
+STEP_S = 0.04  # from frame to frame: what smooths is told for this step, and follows at others
 
 
 class TrackError(ValueError):

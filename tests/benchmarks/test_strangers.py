@@ -61,6 +61,6 @@ def test_strangers_are_chosen_by_name() -> None:
 
 def test_the_bench_watches_the_strangers_chosen(head: HeadModel, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchmarks.tracking.film", lambda scene, head: (scene.name, "truth"))
-    monkeypatch.setattr("benchmarks.tracking.watched", lambda video, head: f"watched {video}")
+    monkeypatch.setattr("benchmarks.tracking.watched", lambda video, head, mm: f"watched {video} {mm}")
     (found,) = ground_truths(head, {"stranger8"})
-    assert found == ("further", "stranger8", "watched stranger8", "truth")
+    assert found == ("further", "stranger8", "watched stranger8 0.0", "truth")

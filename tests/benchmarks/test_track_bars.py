@@ -76,3 +76,22 @@ def test_printed_answers() -> None:
     assert answer["opening_centred_mm"].endswith("yes") and " 40.0 " in answer["opening_centred_mm"]
     assert answer["rotation_deg"].endswith("no; raised on a")
     assert not any("still face" in line for line in lines)
+
+
+def test_a_clip_in_which_nothing_moves_raises_nothing() -> None:
+    def row(clip: str, stage: str, rotation: float, moves: float) -> Row:
+        errors = {"rotation_deg": rotation, "lip_motion_truth": moves, "turn_deg": 0.0, "focal_pct": 0.0}
+        errors |= {
+            "opening_centred_mm": rotation,
+            "jitter_mm": rotation,
+            "surface_mm": 1.0,
+            "mean_surface_mm": 2.0,
+        }
+        return Row("own", clip, stage, errors)
+
+    clips = [row("talks", "landmarks", 1.0, 1.5), row("talks", "refined", 0.5, 1.5)]
+    still = [row("still", "landmarks", 0.01, 0.0), row("still", "refined", 0.02, 0.0)]
+    lines: list[str] = []
+    print_bars([*clips, *still], lines.append)
+    (gain,) = (line for line in lines if line.startswith("rotation_deg lowered"))
+    assert " 50.0 " in gain and gain.endswith("yes")

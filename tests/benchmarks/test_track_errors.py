@@ -16,6 +16,7 @@ from benchmarks.track_errors import (
     recovery_frames,
     separation,
     similarity,
+    surface_error,
 )
 from tracker.head import HeadModel, load_head
 from tracker.track import Track
@@ -89,6 +90,29 @@ def test_an_exact_track_has_no_error(
         assert errors["face_scaled_mm"] == pytest.approx(0, abs=0.01)
         # A tenth of the distance of the face's points from their middle, some 60 mm.
         assert 3 < errors["face_rigid_mm"] < 8
+
+
+def test_a_face_whose_vertices_slid_over_its_surface_lies_on_it(
+    exact: tuple[Track, GroundTruth], head: HeadModel
+) -> None:
+    _, truth = exact
+    middles, first = truth.neutral[truth.faces].mean(1), truth.faces[:, 0]
+    slid = truth.neutral.copy()
+    slid[first] = middles
+    assert 1e3 * np.linalg.norm(slid - truth.neutral, axis=1).mean() > 1
+    neutral = head.template.astype(np.float64)
+    neutral[truth.vertices] = slid
+    # The similarity follows the vertices a little.
+    assert surface_error(neutral, head, truth)[0] < 0.2
+
+
+def test_the_farthest_part_of_a_face_counts(exact: tuple[Track, GroundTruth], head: HeadModel) -> None:
+    _, truth = exact
+    neutral = head.template.astype(np.float64)
+    neutral[truth.vertices] = truth.neutral
+    nose = truth.neutral[:, 2] > np.quantile(truth.neutral[:, 2], 0.97)
+    neutral[truth.vertices[nose], 2] += 0.01
+    assert surface_error(neutral, head, truth)[0] > 0.2
 
 
 def test_a_lip_offset_counts_against_the_neutral_only(

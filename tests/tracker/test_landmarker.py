@@ -1,12 +1,23 @@
 """The landmarker: pure geometry by hand, then a rendered head whose landmarks are known."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
 import cv2
 import numpy as np
 import pytest
 
 from tracker.face_detector import INPUT_SIZE, anchors, decode, letterbox, merge, overlaps, tiles
 from tracker.head import HeadModel, load_head
-from tracker.landmark_indices import BLENDSHAPE_INPUT, BLENDSHAPE_NAMES, MIRRORED, POINTS
+from tracker.landmark_indices import (
+    BLENDSHAPE_INPUT,
+    BLENDSHAPE_NAMES,
+    LEFT_EYE_OUTER,
+    MIRRORED,
+    POINTS,
+    RIGHT_EYE_OUTER,
+)
 from tracker.landmarker import FaceLandmarker, LandmarkTracker, Roi, crop, roi_from_points, track_landmarks
 from tracker.raster import project, render
 
@@ -191,6 +202,21 @@ def test_a_clip_loses_and_finds_the_face(head: HeadModel) -> None:
     assert np.isnan(marks.points[2]).all() and not np.isnan(marks.points[[0, 1, 3, 4]]).any()
     assert marks.points[3, :, 0].mean() > marks.points[1, :, 0].mean() + 100
     assert seen == [1, 2, 3, 4, 5] and np.allclose(marks.time, np.arange(5) / 25)
+
+
+def test_the_region_follows_by_time_and_not_by_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).uniform(100, 200, (POINTS, 3)).astype(np.float32)
+    points[RIGHT_EYE_OUTER, :2], points[LEFT_EYE_OUTER, :2] = (120, 130), (180, 130)
+    landmarker = SimpleNamespace(landmarks=lambda rgb, roi: (points, 1.0, np.zeros(52, np.float32)))
+    picture, places = np.zeros((300, 300, 3), np.uint8), []
+    for rate in (25, 50, 12.5):
+        tracker = LandmarkTracker(cast(FaceLandmarker, landmarker))
+        tracker._roi = replace(roi_from_points(points), x=300.0, side=150.0)
+        for _ in range(round(0.16 * rate)):
+            tracker.next(picture, step_s=1 / rate)
+        places.append((tracker._roi.x, tracker._roi.side))
+    assert places[0][0] < 210
+    np.testing.assert_allclose(places[1:], places[:1] * 2)
 
 
 def test_a_cut_forgets_the_region(head: HeadModel, landmarker: FaceLandmarker) -> None:
