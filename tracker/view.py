@@ -48,8 +48,9 @@ class Window:
     def cut(self, rgb: U8, row: int) -> U8:
         """[height, width] u8 grey; outside of the picture its border goes on."""
         times = int(np.log2(1 / self.scale))
+        rest = self.scale * 2**times
         low = self.origin[row].astype(int)
-        high = low + [2**times * round(side / self.scale / 2**times) for side in self.size]
+        high = low + [2**times * int(np.ceil(side / rest)) for side in self.size]
         limit = np.array(rgb.shape[1::-1])
         first, last = np.clip(low, 0, limit - 1), np.clip(high, 1, limit)
         last = np.maximum(last, first + 1)
@@ -57,7 +58,9 @@ class Window:
         if (missing := np.concatenate([first - low, high - last])).any():
             left, top, right, bottom = np.maximum(missing, 0)
             grey = cv2.copyMakeBorder(grey, top, bottom, left, right, cv2.BORDER_REPLICATE)
-        return cv2.resize(halved(grey, times), self.size, interpolation=cv2.INTER_AREA)
+        # By the scale and not to a size, to which it would be stretched.
+        shrunk = cv2.resize(halved(grey, times), None, fx=rest, fy=rest, interpolation=cv2.INTER_AREA)
+        return shrunk[: self.size[1], : self.size[0]]
 
     def principal(self, principal: F64, row: int | slice) -> F64:
         """[2] px, the principal point in one cut picture, or [.., 2] in several."""

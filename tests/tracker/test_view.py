@@ -1,0 +1,32 @@
+"""A face that is cut out lies where its window says, to a tenth of a pixel, at its edges too."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tracker.view import Window
+
+ORIGIN, SIZE = (7, 5), (97, 61)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.83, 0.64, 0.5, 0.37, 0.31])
+def test_a_ramp_is_read_where_it_was(scale: float) -> None:
+    window = Window(np.array([ORIGIN], np.float64), scale, SIZE)
+    slope = 0.6
+    random = np.random.default_rng(0)
+
+    def read(sign: int) -> np.ndarray:
+        """[width] grey levels of a ramp to the right or the left, whose rounding the rows' mean takes out."""
+        ramp = 128 + sign * slope * (np.arange(400) - 200) + random.random((400, 400))
+        picture = np.repeat(np.floor(ramp).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+        cut = window.cut(picture, 0)
+        assert cut.shape == SIZE[::-1]
+        return cut.mean(0, dtype=np.float64)
+
+    # Up less down: what rounding adds to both goes.
+    found = 200 + (read(1) - read(-1)) / (2 * slope)
+    expected = (np.arange(SIZE[0]) + 0.5) / scale - 0.5 + ORIGIN[0]
+    inside = expected < 395
+    line = np.polyval(np.polyfit(expected[inside], found[inside], 1), expected[inside])
+    assert np.abs(line - expected[inside]).max() < 0.15
