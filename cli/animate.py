@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from personalize.settings import LARGEST_SEED
+
 
 def animate(
     speech: Annotated[Path, typer.Argument(help="Sound or video file with the speech, any voice.")],
@@ -18,7 +20,7 @@ def animate(
     guidance: Annotated[
         float | None, typer.Option(min=0, max=2, help="Guidance scale; the checkpoint's own if not given.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the first sample.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first sample.")] = 0,
     encoder: Annotated[
         str | None,
         typer.Option(help="Folder or hub name of the speech encoder that the checkpoint was trained with."),

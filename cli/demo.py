@@ -8,11 +8,13 @@ from typing import Annotated
 
 import typer
 
+from personalize.settings import LARGEST_SEED
+
 
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the demo.")] = Path("demo"),
     iterations: Annotated[int, typer.Option(min=1, help="Fine-tuning steps; 30000 is the full job.")] = 4000,
-    seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of every random draw.")] = 0,
     json_: Annotated[bool, typer.Option("--json", help="Print the errors as JSON.")] = False,
 ) -> None:
     """Render a talking head, personalize it, and print the tracker's true errors in millimetres."""

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from personalize.settings import LARGEST_SEED
+
 TIMES = "Seconds or shares of the motion: FROM:TO (ends may be left out) or single times, comma-separated."
 
 
@@ -45,7 +47,7 @@ def edit(
     guidance: Annotated[
         float | None, typer.Option(min=0, max=2, help="Guidance scale; the checkpoint's own if not given.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the first sample.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first sample.")] = 0,
     rule: Annotated[
         Literal["posterior", "renoise", "ddim"], typer.Option(help="How a denoising step goes back.")
     ] = "posterior",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import traceback
@@ -33,6 +34,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
 }
 INPUT_ERROR, BUG, INTERRUPTED = 2, 1, 130
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's share of it, the largest file
 
 app = typer.Typer(
     add_completion=False,
@@ -81,6 +83,12 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in FULL:
+            typer.echo(
+                "personalize: no space is left to write the results; free some and run the same command again",
+                err=True,
+            )
+            sys.exit(INPUT_ERROR)
         # Typer's own complaints about options carry an exit code; anything else is a bug of ours.
         if hasattr(error, "format_message"):
             typer.echo(f"personalize: {error.format_message()} (see --help)", err=True)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from personalize.settings import Settings
+from personalize.settings import LARGEST_SEED, Settings
 
 MOST_DISTORTION = 10.0  # that a lens has; also no infinity
 
@@ -19,7 +19,9 @@ def run(
         Path | None, typer.Option(help="Run folder; VIDEO's name + .personalize if not given.")
     ] = None,
     iterations: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = Settings.iterations,
-    seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = Settings.seed,
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of every random draw.")
+    ] = Settings.seed,
     focal: Annotated[float | None, typer.Option(help="Focal length in pixels (not mm), if known.")] = None,
     distortion: Annotated[
         str | None,

@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from personalize.settings import LARGEST_SEED
+
 TABLE_WIDTH = 125
 FIGURES = {
     "div_e": "Div^E",
@@ -45,7 +47,7 @@ def train(
     device: Annotated[
         str, typer.Option(help="cpu or cuda; `torchrun -m cli.main train …` trains on several.")
     ] = "cpu",
-    seed: Annotated[int, typer.Option(help="Seed of every random draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of every random draw.")] = 0,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Train a base model; on VOCAset by the paper's protocol, with its Tables 1, 3b and 3c. Run again to continue."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from personalize.container import MediaInfo, probe
 from personalize.errors import UserError
-from personalize.people import FaceFollower, Tracklet, main_person
+from personalize.people import FaceFollower, Tracklet, main_person, stands_on_head
 from personalize.pictures import read_frames
 from personalize.shots import (
     CUT_WINDOW_S,
@@ -23,15 +23,14 @@ from personalize.shots import (
     MIN_SHOT_S,
     REASONS,
     Bool,
+    Changes,
     Frames,
-    difference,
     find_shots,
     repeated,
     sudden,
-    thumbnail,
     usable_seconds,
 )
-from personalize.sound import on_video_clock, read_audio
+from personalize.sound import AUDIO_RATE, on_video_clock, read_audio
 from personalize.split import make_split
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.landmarker import FaceLandmarker
@@ -49,7 +48,12 @@ MIN_LIGHT, GOOD_LIGHT = 15.0, 35.0  # mean grey level of the face
 MAX_BURNT, GOOD_BURNT = 0.5, 0.2
 MIN_SHARPNESS = 0.2  # see people.sharpness: blocky or noisy video has 0.3 to 0.6
 MAX_TILT_DEG = 60.0  # of the line of the eyes: people tilt their heads by up to 45
+TURN_S, MOST_ON_HEAD = (
+    1.0,
+    0.75,
+)  # between looks whether the picture is upside down; share of upright clips: .2 at most
 SILENCE = 1e-3  # peak of the sound, -60 dB
+MOST_SILENT_S = 1.0  # of pictures before the sound begins or after it ends
 MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it for no longer
 
 DESCRIPTIONS = {
@@ -93,6 +97,7 @@ def ingest_video(path: Path | str, progress: Progress = None) -> Ingested:
             0, f"only {seconds:.1f} s of usable face: results improve up to about 100 s; 30 s are acceptable"
         )
     end = float(frames.time[-1] + np.median(np.diff(frames.time)))
+    warnings += _without_sound(*audio, end)
     return Ingested(media, frames, on_video_clock(*audio, end), make_split(frames), warnings)
 
 
@@ -107,16 +112,27 @@ def _read_sound(media: MediaInfo) -> tuple[F32, float]:
     return samples, start
 
 
+def _without_sound(samples: F32, start: float, end: float) -> list[str]:
+    """That the sound begins late or ends early. start: s after the first picture. end: s, of the pictures."""
+    known = (start, start + len(samples) / AUDIO_RATE)
+    if known[0] <= MOST_SILENT_S and known[1] >= end - MOST_SILENT_S:
+        return []
+    return [
+        f"there is sound from {max(known[0], 0):.1f} to {min(known[1], end):.1f} s of {end:.1f} s: the rest counts as "
+        "silence, and how lips move there as silent"
+    ]
+
+
 def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, list[str]]:
     """Frames of a video with their reasons, and warnings.
 
     In one pass: a cut is told by the pictures behind it too, so what was followed across one is divided afterwards.
     """
-    time, change, again, corrupt, faces = _looked_through(media, progress)
+    time, change, again, corrupt, faces, on_head = _looked_through(media, progress)
     _check_rate(media, time[~again])
     segment = find_shots(time, change)
     mine, others = main_person([shot for face in faces for shot in face.shots(segment)])
-    _check_upright(media, mine)
+    _check_upright(media, mine, on_head)
     total = len(time)
     reason = np.full(total, REASONS.index("no_face"), np.uint8)
     for tracklet in others:
@@ -157,8 +173,13 @@ def _check_rate(media: MediaInfo, changed: F64) -> None:
         )
 
 
-def _check_upright(media: MediaInfo, person: list[Tracklet]) -> None:
-    """Raise UserError when the person lies on their side or head for most of the clip: the head is fitted upright."""
+def _check_upright(media: MediaInfo, person: list[Tracklet], on_head: Sequence[bool]) -> None:
+    """Raise UserError when the person lies on their side or head for most of the clip: the head is fitted upright.
+
+    on_head: whether they do in some of the pictures.
+    """
+    if np.mean([*on_head, False]) > MOST_ON_HEAD:
+        raise UserError(f"{media.path}: the picture is upside down; turn the video")
     across = [shape[LEFT_EYE_OUTER, :2] - shape[RIGHT_EYE_OUTER, :2] for t in person for shape in t.shapes]
     if across:
         tilt = np.degrees(np.arctan2(*np.transpose(across)[::-1]))
@@ -168,30 +189,32 @@ def _check_upright(media: MediaInfo, person: list[Tracklet]) -> None:
             )
 
 
-def _looked_through(media: MediaInfo, progress: Progress) -> tuple[F64, F64, Bool, Bool, list[Tracklet]]:
-    """Times [T] s, how much each picture differs from the last [T], repeated [T], damaged [T]; every face.
+def _looked_through(
+    media: MediaInfo, progress: Progress
+) -> tuple[F64, F64, Bool, Bool, list[Tracklet], list[bool]]:
+    """Times [T] s, how much each picture differs from the last [T], repeated [T], damaged [T]; every face; heads down.
 
     Faces are in pixels of a picture of at most SEARCH_SIDE.
     """
-    reader, follower = read_frames(media.path, SEARCH_SIDE), FaceFollower(FaceLandmarker())
+    landmarker = FaceLandmarker()
+    reader, follower = read_frames(media.path, SEARCH_SIDE), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
     recent = deque[float](maxlen=max(3, round(CUT_WINDOW_S * media.fps)))
-    rows = []
-    last: F32 | None = None
+    changes, rows, on_head = Changes(), [], list[bool]()
     for index, (time, rgb) in enumerate(reader):
-        grey = thumbnail(rgb)
-        change, equal = difference(grey, last) if last is not None else (0.0, False)
+        change, equal = changes.next(rgb, follower.widest)
         rows.append((time, change, equal, reader.damaged))
-        last = grey
         gap = len(rows) > 1 and time - rows[-2][0] > MAX_GAP_S
         follower.add(index, time, rgb, gap or sudden(change, recent))
         recent.append(change)
+        if follower.widest is not None and time >= len(on_head) * TURN_S:
+            on_head.append(stands_on_head(landmarker, rgb, follower.widest))
         if progress is not None:
             progress(min(len(rows), expected), expected)
-    times, changes, same, damaged = zip(*rows)
-    at, differences = np.array(times), np.array(changes)
+    times, each, same, damaged = zip(*rows)
+    at, differences = np.array(times), np.array(each)
     again = repeated(at, differences, np.array(same))
-    return at, differences, again, np.array(damaged), follower.tracklets
+    return at, differences, again, np.array(damaged), follower.tracklets, on_head
 
 
 def _filled(tracklet: Tracklet, time: F64) -> F64:

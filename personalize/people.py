@@ -127,6 +127,12 @@ class FaceFollower:
             )
             tracklet.sightings.append(sighting)
 
+    @property
+    def widest(self) -> F32 | None:
+        """[4] px, box of the widest face that is being followed, where it was last seen."""
+        boxes = [tracklet.sightings[-1].box for tracklet in self._open]
+        return max(boxes, key=lambda box: float(box[2] - box[0]), default=None)
+
     def _find(self, time: float, rgb: U8) -> list[Face]:
         faces = self._landmarker.detect(rgb)
         if not faces:
@@ -138,11 +144,8 @@ class FaceFollower:
 
     def _find_near(self, box: F32, rgb: U8) -> list[Face]:
         """Faces in the surroundings of a box: one too small for the whole picture is seen there."""
-        side = 1.5 * max(box[2] - box[0], box[3] - box[1])
-        x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
-        left, top = max(0, int(x - side)), max(0, int(y - side))
-        found = self._landmarker.detect(rgb[top : int(y + side) + 1, left : int(x + side) + 1])
-        offset = np.array([left, top], np.float32)
+        part, offset = around(rgb, box)
+        found = self._landmarker.detect(part)
         return [Face(f.box + np.tile(offset, 2), f.keypoints + offset, f.score) for f in found]
 
     def _sample(self, tracklet: Tracklet, time: float, face: Face, rgb: U8) -> tuple[F32, U8] | None:
@@ -151,6 +154,24 @@ class FaceFollower:
         tracklet.next_sample = time + SAMPLE_S
         points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
         return (points, _portrait(rgb, points)) if presence >= MIN_PRESENCE else None
+
+
+def around(rgb: U8, box: F32) -> tuple[U8, F32]:
+    """The surroundings of a face's box, three times as large, and their left top corner [2] px in the picture."""
+    side = 1.5 * max(box[2] - box[0], box[3] - box[1])
+    x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
+    left, top = max(0, int(x - side)), max(0, int(y - side))
+    return rgb[top : int(y + side) + 1, left : int(x + side) + 1], np.array([left, top], np.float32)
+
+
+def stands_on_head(landmarker: FaceLandmarker, rgb: U8, box: F32) -> bool:
+    """Whether a face is rather one turned by 180 degrees: such are found too, as upright ones, but less surely."""
+    part, _ = around(rgb, box)
+    upright, turned = (
+        max((face.score for face in landmarker.detect(np.ascontiguousarray(picture))), default=0.0)
+        for picture in (part, part[::-1, ::-1])
+    )
+    return turned > upright
 
 
 def _face_patch(rgb: U8, box: F32) -> U8:

@@ -21,6 +21,7 @@ U8 = NDArray[np.uint8]
 
 # A damaged picture spoils those predicted from it: up to the next key frame, or this long.
 DAMAGE_S = 5.0
+MOST_PASSED_OVER = 50  # pictures whose time stamps lie before what was shown: more are not single broken ones
 _UNSPECIFIED_COLOUR, _BT709 = 2, 1  # FFmpeg's numbers of colour spaces
 AHEAD = 2  # pictures that are decoded while one is used
 Item = TypeVar("Item")
@@ -31,7 +32,7 @@ class FrameReader(Iterator[tuple[float, U8]]):
 
     Times are strictly rising. After each step `damaged` says whether that picture was decoded from broken
     data or predicted from such a picture; pictures that do not decode at all are missing. Every pass over a
-    file gives the same pictures. Raises UserError like `probe`, and beyond the limits.
+    file gives the same pictures. Raises UserError like `probe`, beyond the limits, and where the clock is set back.
     """
 
     def __init__(self, path: Path | str, max_side: int | None = None) -> None:
@@ -52,13 +53,19 @@ class FrameReader(Iterator[tuple[float, U8]]):
     def _read(self) -> Generator[tuple[float, U8, bool]]:
         """Time, picture, and whether it is damaged."""
         start, step = self.info.video_start_s, 1 / self.info.fps if self.info.fps else 0.04
-        last, damage_end = -1.0, -1.0
+        last, damage_end, passed_over = -1.0, -1.0, 0
         matrix, size = np.eye(2, dtype=np.int64), (0, 0)
         with Source(self._path) as source:
             source.video.thread_type = "AUTO"
             for frame in source.decode(source.video):
                 time = frame_time(frame, last + step + start) - start
                 if time <= last:
+                    passed_over += 1
+                    if passed_over > MOST_PASSED_OVER:
+                        raise UserError(
+                            f"{self._path}: its clock is set back after {last:.1f} s, as where several recordings were "
+                            "joined to one file; give one of them, or export them anew as one"
+                        )
                     continue
                 if time > MAX_DURATION_S:
                     raise UserError(f"{self._path}: over {MAX_DURATION_S / 3600:.0f} h long; cut it")

@@ -12,7 +12,7 @@ from personalize.heads import run_head
 from personalize.overlay import check_modes
 from personalize.reporter import Reporter
 from personalize.run import RunFolder
-from personalize.settings import Settings, check_focal
+from personalize.settings import Settings, check_distortion, check_focal
 from personalize.stage import Context, Stage, check_names, run_stages
 from personalize.stages import (
     CameraStage,
@@ -67,6 +67,7 @@ def personalize_video(
     check_names(stages, first, until, force)
     media = probe(video)
     check_focal(settings.focal_px, (media.width, media.height))
+    check_distortion(settings.focal_px, settings.distortion, (media.width, media.height))
     check_modes(settings.overlay)
     try:
         # Asked now, not after the tracking.

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from personalize.errors import UserError
 
 # Of the picture's longer side. Beyond lie fisheyes and telescopes, and focal lengths that are in mm.
 FOCAL_RANGE = (0.3, 10.0)
+# How far out is looked, in times of the picture's corner, for what a lens shows in the corner; in so many steps.
+FARTHEST, STEPS = 4.0, 4000
+LARGEST_SEED = 2**32 - 1
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,27 @@ class Settings:
     tracked: str | None = None
     overlay: tuple[str, ...] = ("wireframe",)
     min_confidence: float = 0.5
+
+
+def check_distortion(focal_px: float | None, distortion: tuple[float, ...], size: tuple[int, int]) -> None:
+    """Raises UserError for a lens that would show two places of the world at one of the picture, (width, height) px."""
+    if focal_px is None or not distortion:
+        return
+    k1, k2, k3 = (*distortion, 0.0, 0.0)[:3]
+    corner, last = math.hypot(*size) / 2 / focal_px, 0.0
+    for step in range(1, STEPS + 1):
+        straight = FARTHEST * corner * step / STEPS
+        seen = straight * (1 + k1 * straight**2 + k2 * straight**4 + k3 * straight**6)
+        if seen <= last:
+            break
+        if seen >= corner:
+            return
+        last = seen
+    given = ",".join(f"{number:g}" for number in distortion)
+    raise UserError(
+        f"--distortion {given}: with --focal {focal_px:g} such a lens folds a picture of {size[0]}x{size[1]} px over "
+        "itself; give the coefficients that were calibrated with that focal length, for pictures of that size"
+    )
 
 
 def check_focal(focal_px: float | None, size: tuple[int, int]) -> None:

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from personalize.people import around
+
 REASONS = (
     "ok",
     "no_face",
@@ -21,6 +23,7 @@ REASONS = (
     "corrupt",
     "duplicate",
 )
+SMALL_FACE = 0.1  # its width, of the picture's long side
 THUMBNAIL = 64  # px, long side of the grey pictures in which cuts and duplicates are looked for
 MAX_GAP_S = 0.25  # a longer time between two pictures ends a shot: nothing is known of what moved there
 MIN_SHOT_S = 0.5  # shorter shots are left out: too little to track
@@ -73,6 +76,29 @@ def difference(grey: F32, last: F32) -> tuple[float, bool]:
     """How a grey picture [h, w] differs from the one before: (mean grey levels, whether it is the same)."""
     change = np.abs(grey - last)
     return float(change.mean()), bool(change.max() <= SAME_LEVEL)
+
+
+class Changes:
+    """Pictures one after another, and how each differs from the one before."""
+
+    def __init__(self) -> None:
+        self._last: tuple[U8, F32] | None = None
+
+    def next(self, rgb: U8, face: F32 | None) -> tuple[float, bool]:
+        """See `difference`. face: [4] px, box of a face in the last picture.
+
+        A small one in a picture that stands still, as of somebody who shows their screen, is looked at closely too: of
+        the whole its motion is next to nothing.
+        """
+        grey, before = thumbnail(rgb), self._last
+        self._last = rgb, grey
+        if before is None:
+            return 0.0, False
+        change, same = difference(grey, before[1])
+        if face is None or face[2] - face[0] >= SMALL_FACE * max(rgb.shape):
+            return change, same
+        nearby, alike = difference(*(thumbnail(around(picture, face)[0]) for picture in (rgb, before[0])))
+        return max(change, nearby), same and alike
 
 
 def sudden(change: float, before: Sequence[float]) -> bool:

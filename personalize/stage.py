@@ -149,6 +149,11 @@ def check_names(stages: Sequence[Stage], first: str | None, until: str | None, f
     for option, value in (("--from", first), ("--until", until), ("--force", force)):
         if value is not None and value not in names:
             raise UserError(f"{option} {value}: no such stage; choose one of {', '.join(names)}")
+    for option, value in (("--from", first), ("--force", force)):
+        if value is not None and until is not None and names.index(value) > names.index(until):
+            raise UserError(
+                f"{option} {value}: this stage comes after --until {until}, and would not be made"
+            )
 
 
 def _open_partial(stage: Stage, key: str, root: Path, force: bool) -> Path:

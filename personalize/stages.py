@@ -52,7 +52,7 @@ def speech_model_assets(settings: Settings) -> dict[str, str]:
 class Ingest(Stage):
     """Video -> times, usable frames and why not, sound, split."""
 
-    name, version, needs = "ingest", 6, (VIDEO,)
+    name, version, needs = "ingest", 7, (VIDEO,)
     makes = ("media.json", "frames.npz", "audio.wav", "split.json")
 
     def make(self, context: Context, folder: Path) -> None:
@@ -268,7 +268,7 @@ class Finetune(Stage):
 class Evaluate(Stage):
     """Metrics on the test split, one clip beside its reference, the report."""
 
-    name, folder, version, reads = "evaluate", "evaluation", 2, ("seed", "overlay")
+    name, folder, version, reads = "evaluate", "evaluation", 2, ("seed", "overlay", "tracked")
     needs = (
         *(VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv"),
         *("overlay/preview.mp4", "overlay/contact_sheet.png", *JUDGED),
@@ -280,4 +280,4 @@ class Evaluate(Stage):
 
     def make(self, context: Context, folder: Path) -> None:
         evaluation = evaluate_run(context.run, context.settings, folder, context.report)
-        write_report(context.run, evaluation, context.settings.overlay, folder)
+        write_report(context.run, evaluation, context.settings, folder)

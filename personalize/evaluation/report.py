@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import csv
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from personalize.files import write_text
 from personalize.overlay import PREVIEW_S
 from personalize.quality import LeftOut, left_out, read_reasons
 from personalize.run import RunFolder, read_camera, read_track, tool_version
+from personalize.settings import Settings
 from tracker.overlay import MODES
 
 # Metric of metrics.json -> name and meaning in the table.
@@ -33,8 +33,8 @@ COLUMNS = {
 LISTED = 12  # spans left out that the report tells of
 
 
-def write_report(run: RunFolder, evaluation: Evaluation, modes: Sequence[str], folder: Path) -> None:
-    """Write `folder`/report.html from the run's files and the evaluation. modes: those of the overlay."""
+def write_report(run: RunFolder, evaluation: Evaluation, settings: Settings, folder: Path) -> None:
+    """Write `folder`/report.html from the run's files and the evaluation."""
     track = read_track(run.path / "refine/track.npz")
     guidance = run.read_json("finetune/guidance.json")
     media = run.read_json("ingest/media.json")
@@ -53,7 +53,7 @@ def write_report(run: RunFolder, evaluation: Evaluation, modes: Sequence[str], f
         warnings=media["warnings"],
         cards=_cards(metrics["systems"], duration, float(used.mean())),
         overlay=_data_url(run.path / "overlay/preview.mp4", "video/mp4"),
-        modes=[{"name": mode, "meaning": MODES[mode]} for mode in modes],
+        modes=[{"name": mode, "meaning": MODES[mode]} for mode in settings.overlay],
         overlay_cut=round(PREVIEW_S) if duration > PREVIEW_S else 0,
         timeline=charts.timeline(track.time, track.confidence, used),
         left_out=_longest(gaps),
@@ -72,7 +72,7 @@ def write_report(run: RunFolder, evaluation: Evaluation, modes: Sequence[str], f
         ],
         guidance_curve=charts.guidance_curve(guidance["sweep"], guidance["chosen"]),
         loss=charts.loss_curve(*_loss(run.path / "finetune/log.csv")),
-        facts=_facts(run, media),
+        facts=_facts(run, media, settings.tracked),
     )
     write_text(folder / "report.html", page)
 
@@ -105,16 +105,24 @@ def _loss(path: Path) -> tuple[list[float], list[float]]:
     return [step for step, _ in rows], [loss for _, loss in rows]
 
 
-def _facts(run: RunFolder, media: dict[str, Any]) -> list[dict[str, str]]:
+def _focal(run: RunFolder, tracked: str | None) -> str:
+    if tracked is not None:
+        return f"{read_track(run.path / 'refine/track.npz').focal:.0f} px (as {Path(tracked).name} has it)"
     camera, _ = read_camera(run.path / "camera")
+    return f"{camera.focal_px:.0f} px ± {camera.focal_sd_log * 100:.0f} % ({camera.method}; {camera.prior})"
+
+
+def _facts(run: RunFolder, media: dict[str, Any], tracked: str | None) -> list[dict[str, str]]:
     registration = run.read_json("registration/registration.json")
     sure = "corrected" if registration["av_offset_sure"] else "not sure, left as it is"
-    focal = f"{camera.focal_px:.0f} px ± {camera.focal_sd_log * 100:.0f} % ({camera.method}; {camera.prior})"
+    # What was tracked before another tracker's result was given is still in the folder, and of no account.
+    unused = () if tracked is None else ("camera", "track")
+    took = {name: entry["seconds"] for name, entry in run.stages.items() if name not in unused}
     facts = {
         "video": f"{media['width']}x{media['height']}, {media['fps']:.2f} frames/s, {media['video_codec']}",
-        "focal length": focal,
+        "focal length": _focal(run, tracked),
         "sound offset": f"{registration['av_offset_estimate_s'] * 1000:+.0f} ms ({sure})",
-        "stages": ", ".join(f"{name} {entry['seconds']:.0f} s" for name, entry in run.stages.items()),
+        "stages": ", ".join(f"{name} {seconds:.0f} s" for name, seconds in took.items()),
     }
     return [{"name": name, "value": value} for name, value in facts.items()]
 

@@ -1,11 +1,14 @@
 """The installed command as a user runs it: exit codes, one line for a mistake, nothing touched."""
 
+import errno
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+import cli.main
 from personalize.subject_data import BASE_CHECKPOINT
 from tests.personalize.video_factory import corner_picture, write_video
 
@@ -82,6 +85,9 @@ def test_an_encoder_a_device_a_focal_length_or_a_mode_that_is_not_there_gets_one
     assert_refused(personalize("run", video, "--distortion", "-0.2", cwd=tmp_path), "--distortion", "--focal")
     assert_refused(personalize("run", video, "--distortion", "-0.2,much", cwd=tmp_path), "-0.2,much")
     assert_refused(personalize("run", video, "--focal", "inf", cwd=tmp_path), "--focal inf", "96x64 px")
+    folding = ("--distortion=-5", "--focal", "100")
+    assert_refused(personalize("run", video, *folding, cwd=tmp_path), "--distortion -5", "folds")
+    assert_refused(personalize("run", video, "--seed", "-1", cwd=tmp_path), "--seed")
     assert_refused(personalize("run", video, "--overlay", "shaded,wire", cwd=tmp_path), "wire:", "wireframe")
     assert_refused(
         personalize("run", video, "--until", "lunch", cwd=tmp_path), "--until lunch", "registration"
@@ -89,3 +95,22 @@ def test_an_encoder_a_device_a_focal_length_or_a_mode_that_is_not_there_gets_one
     subject = ("--subject", BASE_CHECKPOINT)
     assert_refused(personalize("animate", speech, *subject, "--encoder", "nowhere", cwd=tmp_path), "nowhere")
     assert sorted(tmp_path.iterdir()) == [speech, video]
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), 2, "no space is left"),
+        (OSError(errno.EIO, "Input/output error"), 1, "this is a bug"),
+    ],
+)
+def test_a_full_disk_is_no_bug(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: OSError, code: int, said: str
+) -> None:
+    monkeypatch.setattr(cli.main, "app", Mock(side_effect=error))
+    monkeypatch.setattr(sys, "argv", ["personalize", "talk.mp4"])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main.main()
+    assert stopped.value.code == code
+    lines = capsys.readouterr().err.splitlines()
+    assert said in lines[-1] and (len(lines) == 1) == (code == 2)

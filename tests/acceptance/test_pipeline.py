@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,8 +18,9 @@ import pytest
 from model.checkpoint import Checkpoint
 from model.motion import Motion
 from personalize.demo import true_errors
+from personalize.evaluation.report import _facts
 from personalize.pictures import read_frames
-from personalize.run import read_track
+from personalize.run import RunFolder, read_track
 from personalize.sound import read_audio
 from personalize.talkers.film import ASSETS, Truth, demo_identity, render_talker
 from personalize.talkers.motion import talker_motion
@@ -114,6 +116,21 @@ def test_the_report_needs_no_other_file(finished: Path) -> None:
     page = (finished / "report.html").read_text()
     assert re.findall(r"(?:src|href)=\"(?!data:|#)", page) == []
     assert "personalized" in page and "data:video/mp4;base64," in page
+
+
+def test_a_report_of_another_trackers_result_is_of_its_camera(finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "tracked"
+    shutil.copytree(finished, out)
+    media = json.loads((out / "ingest/media.json").read_text())
+
+    def facts(tracked: str | None) -> dict[str, str]:
+        return {fact["name"]: fact["value"] for fact in _facts(RunFolder.open(out), media, tracked)}
+
+    assert "(bundle" in facts(None)["focal length"] and "camera" in facts(None)["stages"]
+    shutil.rmtree(out / "camera")
+    focal = read_track(out / "refine/track.npz").focal
+    assert facts("results/vhap")["focal length"] == f"{focal:.0f} px (as vhap has it)"
+    assert "camera" not in facts("results/vhap")["stages"] and "refine" in facts("results/vhap")["stages"]
 
 
 def content(out: Path) -> dict[str, str]:

@@ -11,10 +11,11 @@ import pytest
 
 from personalize.container import probe
 from personalize.errors import UserError
-from personalize.ingest import MIN_USABLE_S, find_usable, ingest_video
-from personalize.people import FaceFollower, Sighting, Tracklet, main_person
+from personalize.ingest import MIN_USABLE_S, _without_sound, find_usable, ingest_video
+from personalize.people import FaceFollower, Sighting, Tracklet, main_person, stands_on_head
 from personalize.shots import (
     REASONS,
+    Changes,
     Frames,
     difference,
     find_shots,
@@ -60,6 +61,21 @@ def test_a_repeated_picture_is_seen_and_a_small_motion_is_not_one() -> None:
     moved = grey.copy()
     moved[10:12, 10:12] ^= 8
     assert difference(grey, grey)[1] and not difference(moved, grey)[1]
+
+
+def test_a_small_face_that_moves_in_a_still_picture_repeats_nothing() -> None:
+    screen = np.random.default_rng(0).integers(0, 255, (720, 1280, 3), dtype=np.uint8)
+    moved, face = screen.copy(), np.array([1100, 600, 1130, 640], np.float32)
+    moved[628:631, 1112:1116] ^= 31  # a mouth
+    near, far = Changes(), Changes()
+    assert near.next(screen, None) == (0.0, False)
+    far.next(screen, None)
+    assert far.next(moved, None)[1]
+    change, same = near.next(moved, face)
+    assert not same and change > 10 * far.next(screen, None)[0]
+    assert near.next(moved, face) == (0.0, True)
+    # A large face is a large part of the picture.
+    assert far.next(moved, np.array([200, 100, 900, 700], np.float32))[1]
 
 
 @pytest.mark.parametrize(
@@ -202,12 +218,55 @@ def test_a_face_that_lies_on_its_side_is_refused(
     angle = np.radians(tilt_deg)
     for shape in face.shapes:
         shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + 60 * np.array([np.cos(angle), np.sin(angle)])
-    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: Mock(tracklets=[face]))
+    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: Mock(tracklets=[face], widest=None))
     if refused:
         with pytest.raises(UserError, match="on its side"):
             find_usable(probe(path))
     else:
         assert find_usable(probe(path))[0].usable.any()
+
+
+def test_a_head_that_is_found_more_surely_turned_round_stands_on_it() -> None:
+    def detect(rgb: np.ndarray) -> list[Face]:
+        """A face whose hair is bright and above; less sure of one whose hair is below."""
+        box, points = np.zeros(4, np.float32), np.zeros((6, 2), np.float32)
+        return [Face(box, points, 0.9 if rgb[0, 0, 0] > rgb[-1, 0, 0] else 0.6)]
+
+    picture = np.zeros((60, 60, 3), np.uint8)
+    picture[:20] = 200
+    box = np.array([20, 20, 40, 40], np.float32)
+    assert not stands_on_head(Mock(detect=detect), picture, box)
+    assert stands_on_head(Mock(detect=detect), picture[::-1], box)
+
+
+@pytest.mark.parametrize("refused", [True, False])
+def test_a_picture_that_is_upside_down_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: bool
+) -> None:
+    path = write_video(tmp_path / "clip.mkv", moving(60), [i / 25 for i in range(60)])
+    face = tracklet(1, range(60))
+    for shape in face.shapes:
+        shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [60, 0]
+    followed = Mock(tracklets=[face], widest=np.array([20, 20, 40, 40], np.float32))
+    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: followed)
+    # One look of several errs.
+    looks = iter([not refused, *[refused] * 9])
+    monkeypatch.setattr("personalize.ingest.TURN_S", 0.25)
+    monkeypatch.setattr("personalize.ingest.stands_on_head", lambda *_: next(looks))
+    if refused:
+        with pytest.raises(UserError, match="upside down; turn the video"):
+            find_usable(probe(path))
+    else:
+        assert find_usable(probe(path))[0].usable.any()
+
+
+def test_sound_that_does_not_last_as_long_as_the_pictures_is_told() -> None:
+    sound = np.zeros(16_000 * 3, np.float32)
+    assert _without_sound(sound, 0.5, 4.0) == []
+    (late,) = _without_sound(sound, 1.5, 4.5)
+    assert "from 1.5 to 4.5 s of 4.5 s" in late
+    (early,) = _without_sound(sound, -0.2, 11.0)
+    assert "from 0.0 to 2.8 s of 11.0 s" in early
 
 
 @pytest.mark.parametrize(
@@ -227,7 +286,7 @@ def test_too_much_light_is_told_as_too_little_is(
     face = tracklet(1, range(20), light=light, burnt=burnt)
     for shape in face.shapes:
         shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [60, 0]
-    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: Mock(tracklets=[face]))
+    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: Mock(tracklets=[face], widest=None))
     frames, warnings = find_usable(probe(path))
     assert {frames.reasons[index] for index in frames.reason[1:]} == {reason}
     assert (said in " ".join(warnings)) if said else not any("face is" in text for text in warnings)

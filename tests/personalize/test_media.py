@@ -109,6 +109,16 @@ def test_sound_that_begins_before_the_picture_is_cut_on_its_clock() -> None:
     assert list(on_video_clock(np.arange(6, dtype=np.float32), -0.5, 2.0, rate=4)) == [2, 3, 4, 5, 0, 0, 0, 0]
 
 
+def test_recordings_joined_as_files_are_refused(tmp_path: Path) -> None:
+    """Their clock begins anew: the pictures of the one would be paired with the sound of the other."""
+    times = [i / 25 for i in range(60)]
+    parts = [write_video(tmp_path / f"{seed}.ts", moving(60, seed), times).read_bytes() for seed in range(2)]
+    joined = tmp_path / "joined.ts"
+    joined.write_bytes(b"".join(parts))
+    with pytest.raises(UserError, match=r"joined\.ts: its clock is set back after 2\.4 s"):
+        list(read_frames(joined))
+
+
 def test_video_without_sound_gives_none(tmp_path: Path) -> None:
     path = write_video(tmp_path / "v.mp4", moving(5), STEADY[:5])
     assert not probe(path).has_audio and len(read_audio(path)[0]) == 0

@@ -112,6 +112,9 @@ def test_until_from_and_force(context: Context) -> None:
     assert (Count.made, Double.made) == (3, 2)
     with pytest.raises(UserError, match="no such stage; choose one of count, double"):
         run_stages(STAGES, context, until="counts")
+    for option in ({"first": "double"}, {"force": "double"}):
+        with pytest.raises(UserError, match="after --until count, and would not be made"):
+            run_stages(STAGES, context, until="count", **option)
 
 
 def test_a_cached_stage_says_again_what_it_warned_of(
