@@ -230,7 +230,10 @@ def similarity(source: F64, target: F64, scaled: bool = True) -> Similarity:
 
 
 def _align(source: F64, truth: GroundTruth) -> Similarity:
-    """Similarity between head frames whose axes point alike, by nearest points of source [n, 3] m and the truth."""
+    """Similarity between head frames whose axes point alike, by nearest points of source [n, 3] m and the truth.
+
+    The farthest fifth does not count: the two heads do not end at the same rim.
+    """
     spread = [np.linalg.norm(points - points.mean(0), axis=1).mean() for points in (truth.neutral, source)]
     scale, turned = float(spread[0] / spread[1]), np.eye(3)
     shift = truth.neutral.mean(0) - scale * source.mean(0)

@@ -48,10 +48,8 @@ MIN_LIGHT, GOOD_LIGHT = 15.0, 35.0  # mean grey level of the face
 MAX_BURNT, GOOD_BURNT = 0.5, 0.2
 MIN_SHARPNESS = 0.2  # see people.sharpness: blocky or noisy video has 0.3 to 0.6
 MAX_TILT_DEG = 60.0  # of the line of the eyes: people tilt their heads by up to 45
-TURN_S, MOST_ON_HEAD = (
-    1.0,
-    0.75,
-)  # between looks whether the picture is upside down; share of upright clips: .2 at most
+TURN_S = 1.0  # between looks whether the picture is upside down
+MOST_ON_HEAD = 0.75  # share of the looks: upright clips have .2 at most
 SILENCE = 1e-3  # peak of the sound, -60 dB
 MOST_SILENT_S = 1.0  # of pictures before the sound begins or after it ends
 MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it for no longer
@@ -200,14 +198,15 @@ def _looked_through(
     reader, follower = read_frames(media.path, SEARCH_SIDE), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
     recent = deque[float](maxlen=max(3, round(CUT_WINDOW_S * media.fps)))
-    changes, rows, on_head = Changes(), [], list[bool]()
+    changes, rows, on_head, next_look = Changes(), [], list[bool](), 0.0
     for index, (time, rgb) in enumerate(reader):
         change, equal = changes.next(rgb, follower.widest)
         rows.append((time, change, equal, reader.damaged))
         gap = len(rows) > 1 and time - rows[-2][0] > MAX_GAP_S
         follower.add(index, time, rgb, gap or sudden(change, recent))
         recent.append(change)
-        if follower.widest is not None and time >= len(on_head) * TURN_S:
+        if follower.widest is not None and time >= next_look:
+            next_look = time + TURN_S
             on_head.append(stands_on_head(landmarker, rgb, follower.widest))
         if progress is not None:
             progress(min(len(rows), expected), expected)

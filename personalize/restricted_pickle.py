@@ -26,9 +26,8 @@ from personalize.errors import UserError
 
 LARGEST_PICKLE_BYTES = 2 << 30
 LARGEST_SPARSE_BYTES = 256 << 20  # of a sparse matrix made dense in double precision
-LARGEST_TUPLE = (
-    1 << 16
-)  # members and members of members, as often as they are met: as a key's hash meets them
+# Members and members of members of a tuple, as often as they are met: a key's hash meets them so often.
+LARGEST_TUPLE = 1 << 16
 DTYPE = re.compile(r"[<>|=]?[biufcSU]\d{1,6}")
 # What a damaged or hostile file makes the interpreter of pickles, or the building after it, raise.
 BROKEN = (
