@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable
+from types import FrameType
 from typing import Annotated
 
 # Threads are set on purpose, per stage: left alone, OpenMP and BLAS both take every core and wait for each other.
@@ -72,9 +74,23 @@ def with_default_command(arguments: list[str]) -> list[str]:
     return ["run", *arguments]
 
 
+def _interruptions() -> list[int]:
+    """Filled when the user interrupts: a compiled module that is just imported may make another error of it."""
+    told: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        told.append(number)
+        signal.default_int_handler(number, frame)
+
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, interrupt)
+    return told
+
+
 def main() -> None:
     """Entry point. Exit codes: 0 done, 2 the user's input, 130 interrupted, 1 a bug."""
     arguments = with_default_command(sys.argv[1:]) or ["--help"]
+    interruptions = _interruptions()
     try:
         code = app(arguments, standalone_mode=False)
     except UserError as error:
@@ -83,14 +99,16 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in FULL:
+        if interruptions:
+            code = INTERRUPTED
+        elif isinstance(error, OSError) and error.errno in FULL:
             typer.echo(
                 "personalize: no space is left to write the results; free some and run the same command again",
                 err=True,
             )
-            sys.exit(INPUT_ERROR)
+            code = INPUT_ERROR
         # Typer's own complaints about options carry an exit code; anything else is a bug of ours.
-        if hasattr(error, "format_message"):
+        elif hasattr(error, "format_message"):
             typer.echo(f"personalize: {error.format_message()} (see --help)", err=True)
             code = INPUT_ERROR
         else:

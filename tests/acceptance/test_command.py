@@ -1,8 +1,11 @@
 """The installed command as a user runs it: exit codes, one line for a mistake, nothing touched."""
 
 import errno
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -95,6 +98,28 @@ def test_an_encoder_a_device_a_focal_length_or_a_mode_that_is_not_there_gets_one
     subject = ("--subject", BASE_CHECKPOINT)
     assert_refused(personalize("animate", speech, *subject, "--encoder", "nowhere", cwd=tmp_path), "nowhere")
     assert sorted(tmp_path.iterdir()) == [speech, video]
+
+
+def test_an_interruption_that_a_module_makes_another_error_of_is_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def importing(*_: object, **__: object) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(5)
+        except KeyboardInterrupt:
+            raise AttributeError("module 'numpy._core' has no attribute '_multiarray_umath'") from None
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(cli.main, "app", importing)
+    monkeypatch.setattr(sys, "argv", ["personalize", "talk.mp4"])
+    try:
+        with pytest.raises(SystemExit) as stopped:
+            cli.main.main()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert stopped.value.code == 130
+    assert capsys.readouterr().err == "personalize: interrupted; run the same command again to continue\n"
 
 
 @pytest.mark.parametrize(
