@@ -97,7 +97,7 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 11, ("focal_px", "distortion")
+    name, version, reads = "camera", 12, ("focal_px", "distortion")
     needs = ("ingest/media.json", "landmarks/landmarks.npz", "landmarks/features.npz")
     makes = ("camera.json", "bundle.npz")
 

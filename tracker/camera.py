@@ -84,9 +84,9 @@ def _telling(points: NDArray[np.floating]) -> NDArray[np.int64]:
 def _told(prior: Camera, scene: RigidScene, focal: float, sd_log: float) -> Camera:
     """The camera that the adjustment, in which the prior counts, found; the prior's where it learnt too little."""
     low, high = (bound * max(prior.size) for bound in FOCAL_RANGE)
-    sd_log = float(np.hypot(sd_log, LEAST_SD_LOG))
+    sd_log = min(float(np.hypot(sd_log, LEAST_SD_LOG)), prior.focal_sd_log)
     still = _turn_deg(scene) < MIN_TURN_DEG
-    if prior.method == "given" or still or sd_log > TOLD * prior.focal_sd_log or not low <= focal <= high:
+    if prior.method == "given" or still or sd_log > TOLD * PRIOR_SD_LOG or not low <= focal <= high:
         return prior
     return replace(prior, focal_px=focal, focal_sd_log=sd_log, method="bundle")
 
