@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from personalize.errors import UserError
 
 # Of the picture's longer side. Beyond lie fisheyes and telescopes, and focal lengths that are in mm.
 FOCAL_RANGE = (0.3, 10.0)
-# How far out is looked, in times of the picture's corner, for what a lens shows in the corner; in so many steps.
+# How far out is looked, in times of half the longer side, for what a lens shows at its end; in so many steps. What
+# lies in the corners is no face, and few calibrations hold there.
 FARTHEST, STEPS = 4.0, 4000
 LARGEST_SEED = 2**32 - 1
 
@@ -51,13 +51,13 @@ def check_distortion(focal_px: float | None, distortion: tuple[float, ...], size
     if focal_px is None or not distortion:
         return
     k1, k2, k3 = (*distortion, 0.0, 0.0)[:3]
-    corner, last = math.hypot(*size) / 2 / focal_px, 0.0
+    edge, last = max(size) / 2 / focal_px, 0.0
     for step in range(1, STEPS + 1):
-        straight = FARTHEST * corner * step / STEPS
+        straight = FARTHEST * edge * step / STEPS
         seen = straight * (1 + k1 * straight**2 + k2 * straight**4 + k3 * straight**6)
         if seen <= last:
             break
-        if seen >= corner:
+        if seen >= edge:
             return
         last = seen
     given = ",".join(f"{number:g}" for number in distortion)
