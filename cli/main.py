@@ -94,8 +94,9 @@ def main() -> None:
     try:
         code = app(arguments, standalone_mode=False)
     except UserError as error:
-        typer.echo(f"personalize: {error}", err=True)
-        code = INPUT_ERROR
+        code = INTERRUPTED if interruptions else INPUT_ERROR
+        if code == INPUT_ERROR:
+            typer.echo(f"personalize: {error}", err=True)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except Exception as error:

@@ -22,6 +22,7 @@ from personalize.shots import (
     MAX_GAP_S,
     MIN_SHOT_S,
     REASONS,
+    SMALL_FACE,
     Bool,
     Changes,
     Frames,
@@ -81,8 +82,8 @@ class Ingested:
 def ingest_video(path: Path | str, progress: Progress = None) -> Ingested:
     """Look through a video: times, usable frames, sound, split.
 
-    Raises UserError when the file is no video, has no sound or silence only, too few pictures a second, lies on its
-    side, or has under 10 s of one usable face.
+    Raises UserError when the file is no video, its clock is set back, it has no sound or silence only, too few pictures
+    a second, lies on its side or upside down, or has under 10 s of one usable face.
     """
     media = probe(path)
     audio = _read_sound(media)
@@ -95,8 +96,11 @@ def ingest_video(path: Path | str, progress: Progress = None) -> Ingested:
             0, f"only {seconds:.1f} s of usable face: results improve up to about 100 s; 30 s are acceptable"
         )
     end = float(frames.time[-1] + np.median(np.diff(frames.time)))
+    sound = on_video_clock(*audio, end)
+    if not sound.any():
+        raise UserError(f"{media.path}: the sound lies before or behind all pictures; export the video again")
     warnings += _without_sound(*audio, end)
-    return Ingested(media, frames, on_video_clock(*audio, end), make_split(frames), warnings)
+    return Ingested(media, frames, sound, make_split(frames), warnings)
 
 
 def _read_sound(media: MediaInfo) -> tuple[F32, float]:
@@ -176,8 +180,6 @@ def _check_upright(media: MediaInfo, person: list[Tracklet], on_head: Sequence[b
 
     on_head: whether they do in some of the pictures.
     """
-    if np.mean([*on_head, False]) > MOST_ON_HEAD:
-        raise UserError(f"{media.path}: the picture is upside down; turn the video")
     across = [shape[LEFT_EYE_OUTER, :2] - shape[RIGHT_EYE_OUTER, :2] for t in person for shape in t.shapes]
     if across:
         tilt = np.degrees(np.arctan2(*np.transpose(across)[::-1]))
@@ -185,6 +187,8 @@ def _check_upright(media: MediaInfo, person: list[Tracklet], on_head: Sequence[b
             raise UserError(
                 f"{media.path}: the picture lies on its side, no upright face is in it; turn the video"
             )
+    if np.mean([*on_head, False]) > MOST_ON_HEAD:
+        raise UserError(f"{media.path}: the picture is upside down; turn the video")
 
 
 def _looked_through(
@@ -200,18 +204,23 @@ def _looked_through(
     recent = deque[float](maxlen=max(3, round(CUT_WINDOW_S * media.fps)))
     changes, rows, on_head, next_look = Changes(), [], list[bool](), 0.0
     for index, (time, rgb) in enumerate(reader):
-        change, equal = changes.next(rgb, follower.widest)
-        rows.append((time, change, equal, reader.damaged))
+        whole, near = changes.next(rgb, follower.widest)
+        rows.append((time, whole, near, reader.damaged))
         gap = len(rows) > 1 and time - rows[-2][0] > MAX_GAP_S
-        follower.add(index, time, rgb, gap or sudden(change, recent))
-        recent.append(change)
+        follower.add(index, time, rgb, gap or sudden(near[0], recent))
+        recent.append(near[0])
         if follower.widest is not None and time >= next_look:
             next_look = time + TURN_S
             on_head.append(stands_on_head(landmarker, rgb, follower.widest))
         if progress is not None:
             progress(min(len(rows), expected), expected)
-    times, each, same, damaged = zip(*rows)
-    at, differences = np.array(times), np.array(each)
+    times, *views, damaged = zip(*rows)
+    # Once for the clip: two measures side by side would look like motion and rest.
+    widths = [sighting.box[2] - sighting.box[0] for face in follower.tracklets for sighting in face.sightings]
+    small = bool(widths) and float(np.median(widths)) < SMALL_FACE * min(
+        SEARCH_SIDE, max(media.width, media.height)
+    )
+    at, (differences, same) = np.array(times), (np.array(column) for column in zip(*views[small]))
     again = repeated(at, differences, np.array(same))
     return at, differences, again, np.array(damaged), follower.tracklets, on_head
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -21,7 +21,7 @@ U8 = NDArray[np.uint8]
 
 # A damaged picture spoils those predicted from it: up to the next key frame, or this long.
 DAMAGE_S = 5.0
-MOST_PASSED_OVER = 50  # pictures whose time stamps lie before what was shown: more are not single broken ones
+MOST_SET_BACK = 50  # pictures in a row whose time stamps lie before what was shown: more are not broken ones
 _UNSPECIFIED_COLOUR, _BT709 = 2, 1  # FFmpeg's numbers of colour spaces
 AHEAD = 2  # pictures that are decoded while one is used
 Item = TypeVar("Item")
@@ -53,29 +53,17 @@ class FrameReader(Iterator[tuple[float, U8]]):
     def _read(self) -> Generator[tuple[float, U8, bool]]:
         """Time, picture, and whether it is damaged."""
         start, step = self.info.video_start_s, 1 / self.info.fps if self.info.fps else 0.04
-        last, damage_end, passed_over = -1.0, -1.0, 0
-        matrix, size = np.eye(2, dtype=np.int64), (0, 0)
+        damage_end, size = -1.0, (0, 0)
+        matrix = np.eye(2, dtype=np.int64)
         with Source(self._path) as source:
             source.video.thread_type = "AUTO"
-            for frame in source.decode(source.video):
-                time = frame_time(frame, last + step + start) - start
-                if time <= last:
-                    passed_over += 1
-                    if passed_over > MOST_PASSED_OVER:
-                        raise UserError(
-                            f"{self._path}: its clock is set back after {last:.1f} s, as where several recordings were "
-                            "joined to one file; give one of them, or export them anew as one"
-                        )
-                    continue
-                if time > MAX_DURATION_S:
-                    raise UserError(f"{self._path}: over {MAX_DURATION_S / 3600:.0f} h long; cut it")
-                if last < 0:  # later pictures are scaled to the size of the first
+            for time, frame in _in_time(source.decode(source.video), start, step, self._path):
+                if not size[0]:  # later pictures are scaled to the size of the first
                     matrix, size = display_matrix(frame), self._size(*square_size(source.video, frame))
                 if frame.is_corrupt:
                     damage_end = time + DAMAGE_S
                 elif frame.key_frame:
                     damage_end = -1.0
-                last = time
                 yield time, _turned(self._to_rgb(frame, size), matrix), time <= damage_end
 
     def _size(self, width: int, height: int) -> tuple[int, int]:
@@ -101,6 +89,29 @@ class FrameReader(Iterator[tuple[float, U8]]):
 def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:
     """Pictures of a video, see FrameReader. `max_side`: shrink to at most this many px on the long side."""
     return FrameReader(path, max_side)
+
+
+def _in_time(frames: Iterable[Any], start: float, step: float, path: Path) -> Generator[tuple[float, Any]]:
+    """Those of a stream's frames that lie behind all before them: their times, s after `start`, and they themselves.
+
+    step: s, from a frame to one without a time. Raises UserError beyond the limit and where the clock is set back.
+    """
+    before, last, set_back = -1.0, -1.0, 0
+    for frame in frames:
+        time = frame_time(frame, last + step + start) - start
+        if time > MAX_DURATION_S:
+            raise UserError(f"{path}: over {MAX_DURATION_S / 3600:.0f} h long; cut it")
+        if time > last:
+            before, last, set_back = last, time, 0
+            yield time, frame
+            continue
+        # Behind the one before last as well: else it is the last whose stamp is broken.
+        set_back += time <= before
+        if set_back > MOST_SET_BACK:
+            raise UserError(
+                f"{path}: its clock is set back after {last:.1f} s, as where several recordings were joined to one "
+                "file; give one of them, or export them anew as one"
+            )
 
 
 def _ahead(items: Generator[Item]) -> Iterator[Item]:

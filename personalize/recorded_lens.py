@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
@@ -25,21 +26,26 @@ def recorded_focal_mm(path: Path) -> float:
     """Focal length that a QuickTime or MP4 file says its camera had, mm on film 36 mm wide; 0 where it says none."""
     with path.open("rb") as file:
         whole = (b"", 0, file.seek(0, 2))
-        try:
-            for movie in _children(file, whole, b"moov"):
-                for place in (*_children(file, movie, b"trak"), movie):
-                    for meta in _children(file, place, b"meta"):
+        for movie in _children(file, whole, b"moov"):
+            for place in (*_children(file, movie, b"trak"), movie):
+                for meta in _children(file, place, b"meta"):
+                    try:
                         mm = _focal_mm(file, meta)
-                        if RANGE_MM[0] <= mm <= RANGE_MM[1]:
-                            return mm
-        except (struct.error, ValueError):
-            pass  # broken metadata tell nothing; the pictures may be whole
+                    except (struct.error, ValueError):
+                        continue
+                    if RANGE_MM[0] <= mm <= RANGE_MM[1]:
+                        return mm
     return 0.0
 
 
-def _children(file: BinaryIO, box: Box, kind: bytes) -> Iterator[Box]:
-    """The boxes of one type directly inside a box."""
-    return (child for child in islice(_boxes(file, *box[1:]), MOST_BOXES) if child[0] == kind)
+def _children(file: BinaryIO, box: Box, kind: bytes) -> list[Box]:
+    """The boxes of one type directly inside a box, up to where it is broken: the pictures may be whole."""
+    found = []
+    with suppress(struct.error, ValueError):
+        for child in islice(_boxes(file, *box[1:]), MOST_BOXES):
+            if child[0] == kind:
+                found.append(child)
+    return found
 
 
 def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[Box]:

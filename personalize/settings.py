@@ -8,9 +8,9 @@ from personalize.errors import UserError
 
 # Of the picture's longer side. Beyond lie fisheyes and telescopes, and focal lengths that are in mm.
 FOCAL_RANGE = (0.3, 10.0)
-# How far out is looked, in times of half the longer side, for what a lens shows at its end; in so many steps. What
-# lies in the corners is no face, and few calibrations hold there.
-FARTHEST, STEPS = 4.0, 4000
+# How far out is looked, in times of half the longer side, for what a lens shows at ENOUGH of that; in so many steps.
+# Farther out is hardly a face, and few calibrations hold there.
+FARTHEST, STEPS, ENOUGH = 4.0, 4000, 0.85
 LARGEST_SEED = 2**32 - 1
 
 
@@ -57,7 +57,7 @@ def check_distortion(focal_px: float | None, distortion: tuple[float, ...], size
         seen = straight * (1 + k1 * straight**2 + k2 * straight**4 + k3 * straight**6)
         if seen <= last:
             break
-        if seen >= edge:
+        if seen >= ENOUGH * edge:
             return
         last = seen
     given = ",".join(f"{number:g}" for number in distortion)

@@ -23,7 +23,7 @@ REASONS = (
     "corrupt",
     "duplicate",
 )
-SMALL_FACE = 0.1  # its width, of the picture's long side
+SMALL_FACE = 0.1  # its usual width, of the picture's long side
 THUMBNAIL = 64  # px, long side of the grey pictures in which cuts and duplicates are looked for
 MAX_GAP_S = 0.25  # a longer time between two pictures ends a shot: nothing is known of what moved there
 MIN_SHOT_S = 0.5  # shorter shots are left out: too little to track
@@ -84,21 +84,21 @@ class Changes:
     def __init__(self) -> None:
         self._last: tuple[U8, F32] | None = None
 
-    def next(self, rgb: U8, face: F32 | None) -> tuple[float, bool]:
-        """See `difference`. face: [4] px, box of a face in the last picture.
+    def next(self, rgb: U8, face: F32 | None) -> tuple[tuple[float, bool], tuple[float, bool]]:
+        """See `difference`: of the whole, and of that or what surrounds a face, whichever is more.
 
-        A small one in a picture that stands still, as of somebody who shows their screen, is looked at closely too: of
-        the whole its motion is next to nothing.
+        face: [4] px, its box in the last picture. Where it is small in a picture that stands still, as of somebody who
+        shows their screen, its motion is next to nothing of the whole.
         """
         grey, before = thumbnail(rgb), self._last
         self._last = rgb, grey
         if before is None:
-            return 0.0, False
-        change, same = difference(grey, before[1])
-        if face is None or face[2] - face[0] >= SMALL_FACE * max(rgb.shape):
-            return change, same
+            return (0.0, False), (0.0, False)
+        whole = change, same = difference(grey, before[1])
+        if face is None or face[2] - face[0] >= 2 * SMALL_FACE * max(rgb.shape):
+            return whole, whole
         nearby, alike = difference(*(thumbnail(around(picture, face)[0]) for picture in (rgb, before[0])))
-        return max(change, nearby), same and alike
+        return whole, (max(change, nearby), same and alike)
 
 
 def sudden(change: float, before: Sequence[float]) -> bool:

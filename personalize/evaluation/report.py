@@ -107,7 +107,7 @@ def _loss(path: Path) -> tuple[list[float], list[float]]:
 
 def _focal(run: RunFolder, tracked: str | None) -> str:
     if tracked is not None:
-        return f"{read_track(run.path / 'refine/track.npz').focal:.0f} px (as {Path(tracked).name} has it)"
+        return f"{read_track(run.path / 'refine/track.npz').focal:.0f} px (as {Path(tracked).resolve().name} has it)"
     camera, _ = read_camera(run.path / "camera")
     return f"{camera.focal_px:.0f} px ± {camera.focal_sd_log * 100:.0f} % ({camera.method}; {camera.prior})"
 

@@ -12,6 +12,7 @@ from unittest.mock import Mock
 import pytest
 
 import cli.main
+from personalize.errors import UserError
 from personalize.subject_data import BASE_CHECKPOINT
 from tests.personalize.video_factory import corner_picture, write_video
 
@@ -100,15 +101,18 @@ def test_an_encoder_a_device_a_focal_length_or_a_mode_that_is_not_there_gets_one
     assert sorted(tmp_path.iterdir()) == [speech, video]
 
 
+@pytest.mark.parametrize(
+    "error", [AttributeError("no _multiarray_umath"), UserError("wav2vec2 cannot be read")]
+)
 def test_an_interruption_that_a_module_makes_another_error_of_is_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception
 ) -> None:
     def importing(*_: object, **__: object) -> None:
         try:
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(5)
         except KeyboardInterrupt:
-            raise AttributeError("module 'numpy._core' has no attribute '_multiarray_umath'") from None
+            raise error from None
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setattr(cli.main, "app", importing)

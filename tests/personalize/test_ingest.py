@@ -67,15 +67,38 @@ def test_a_small_face_that_moves_in_a_still_picture_repeats_nothing() -> None:
     screen = np.random.default_rng(0).integers(0, 255, (720, 1280, 3), dtype=np.uint8)
     moved, face = screen.copy(), np.array([1100, 600, 1130, 640], np.float32)
     moved[628:631, 1112:1116] ^= 31  # a mouth
-    near, far = Changes(), Changes()
-    assert near.next(screen, None) == (0.0, False)
-    far.next(screen, None)
-    assert far.next(moved, None)[1]
-    change, same = near.next(moved, face)
-    assert not same and change > 10 * far.next(screen, None)[0]
-    assert near.next(moved, face) == (0.0, True)
+    changes = Changes()
+    assert changes.next(screen, face) == ((0.0, False), (0.0, False))
+    (whole, same), (near, alike) = changes.next(moved, face)
+    assert same and not alike and near > 10 * whole
+    assert changes.next(moved, face) == ((0.0, True), (0.0, True))
     # A large face is a large part of the picture.
-    assert far.next(moved, np.array([200, 100, 900, 700], np.float32))[1]
+    whole_only = changes.next(screen, np.array([200, 100, 900, 700], np.float32))
+    assert whole_only[0] == whole_only[1] == (whole, True)
+
+
+def test_how_closely_is_looked_is_decided_once_for_a_clip(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A face about as wide as the limit, whose box flickers about it."""
+    path = write_video(tmp_path / "clip.mkv", moving(60), [i / 25 for i in range(60)])
+    looked: list[np.ndarray] = []
+    monkeypatch.setattr(
+        "personalize.ingest.Changes", lambda: Mock(next=lambda rgb, face: ((1.0, False), (5.0, False)))
+    )
+    monkeypatch.setattr(
+        "personalize.ingest.repeated", lambda time, change, same: looked.append(change) or same
+    )
+    for width, change in ((9.0, 5.0), (11.0, 1.0)):  # of 96 px
+        face = tracklet(1, range(60))
+        for shape in face.shapes:
+            shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [60, 0]
+        for sighting in face.sightings:
+            sighting.box[:] = (20, 20, 20 + width, 40)
+        followed = Mock(tracklets=[face], widest=None)
+        monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _, followed=followed: followed)
+        find_usable(probe(path))
+        assert set(looked.pop()) == {change}
 
 
 @pytest.mark.parametrize(
@@ -258,6 +281,30 @@ def test_a_picture_that_is_upside_down_is_refused(
             find_usable(probe(path))
     else:
         assert find_usable(probe(path))[0].usable.any()
+
+
+def test_a_head_on_its_side_is_told_so_whatever_the_detector_finds_surer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_video(tmp_path / "clip.mkv", moving(60), [i / 25 for i in range(60)])
+    face = tracklet(1, range(60))
+    for shape in face.shapes:
+        shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [0, 60]
+    followed = Mock(tracklets=[face], widest=np.array([20, 20, 40, 40], np.float32))
+    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: followed)
+    monkeypatch.setattr("personalize.ingest.stands_on_head", lambda *_: True)
+    with pytest.raises(UserError, match="lies on its side"):
+        find_usable(probe(path))
+
+
+def test_sound_beside_all_pictures_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_video(
+        tmp_path / "clip.mkv", moving(20), [i / 25 for i in range(20)], clicks([1], 2), sound_start=50
+    )
+    frames = frames_of(np.arange(300) / 25, np.ones(300, bool))
+    monkeypatch.setattr("personalize.ingest.find_usable", lambda media, progress: (frames, []))
+    with pytest.raises(UserError, match="before or behind all pictures"):
+        ingest_video(path)
 
 
 def test_sound_that_does_not_last_as_long_as_the_pictures_is_told() -> None:

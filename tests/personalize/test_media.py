@@ -7,6 +7,7 @@ import threading
 import time
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 
 from personalize.container import probe
 from personalize.errors import UserError
-from personalize.pictures import _turned, read_frames
+from personalize.pictures import _in_time, _turned, read_frames
 from personalize.sound import on_video_clock, read_audio, write_wav
 from personalize.video_writer import VideoWriter
 from tests.personalize.video_factory import RATE, clicks, corner_picture, moving, write_video
@@ -117,6 +118,23 @@ def test_recordings_joined_as_files_are_refused(tmp_path: Path) -> None:
     joined.write_bytes(b"".join(parts))
     with pytest.raises(UserError, match=r"joined\.ts: its clock is set back after 2\.4 s"):
         list(read_frames(joined))
+
+
+@pytest.mark.parametrize("stamps", ["ahead", "equal", "early"])
+def test_broken_time_stamps_cost_their_pictures_and_no_more(tmp_path: Path, stamps: str) -> None:
+    times = [i / 25 for i in range(300)]
+    if stamps == "ahead":  # one, by 4 s
+        times[100] += 4
+        left = 200
+    elif stamps == "equal":
+        times[8::8] = times[7::8][: len(times[8::8])]
+        left = 300 - len(times[8::8])
+    else:
+        times[6::6] = [time - 0.05 for time in times[6::6]]
+        left = 300 - len(times[6::6])
+    # As they are: no encoder would write such times.
+    frames = [SimpleNamespace(pts=round(t * 1000), time_base=Fraction(1, 1000)) for t in times]
+    assert len(list(_in_time(frames, 0.0, 0.04, tmp_path))) == left
 
 
 def test_video_without_sound_gives_none(tmp_path: Path) -> None:

@@ -111,6 +111,13 @@ def test_broken_metadata_raise_nothing(film: Path, data: st.DataObject) -> None:
     assert 0 <= recorded_focal_mm(path) <= 400
 
 
+def test_what_a_broken_track_does_not_tell_the_movie_may(film: Path) -> None:
+    held = metadata(UNSIGNED, b"\x1a").replace(b"ilst", b"ilst\x7f", 1)
+    path = with_metadata(film, "two.mp4", [b"moov", b"trak"], held)
+    path.write_bytes(inside(path.read_bytes(), [b"moov"], metadata(UNSIGNED, b"\x1c")))
+    assert recorded_focal_mm(path) == 28
+
+
 def test_a_file_of_nothing_but_boxes_is_soon_given_up(film: Path) -> None:
     path = with_metadata(film, "many.mp4", [b"moov"], box(b"free") * 200_000, metadata(UNSIGNED, b"\x1a"))
     assert recorded_focal_mm(path) == 0

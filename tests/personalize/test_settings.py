@@ -40,6 +40,7 @@ def test_a_lens_that_folds_the_picture_is_refused(focal: float, distortion: tupl
         (900.0, (-0.21, 0.05)),
         (450.0, (-0.28,)),
         (300.0, (-0.3, 0.1)),
+        (290.0, (-0.265, 0.085, -0.0147)),
         (400.0, (0.3, 0.1, 0.02)),
     ],
 )
