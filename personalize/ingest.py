@@ -21,6 +21,7 @@ from personalize.shots import (
     F64,
     MAX_GAP_S,
     MIN_SHOT_S,
+    NEARLY_SMALL,
     REASONS,
     SMALL_FACE,
     Bool,
@@ -217,11 +218,10 @@ def _looked_through(
     times, *views, damaged = zip(*rows)
     # Once for the clip: two measures side by side would look like motion and rest.
     widths = [sighting.box[2] - sighting.box[0] for face in follower.tracklets for sighting in face.sightings]
-    small = bool(widths) and float(np.median(widths)) < SMALL_FACE * min(
-        SEARCH_SIDE, max(media.width, media.height)
-    )
-    at, (differences, same) = np.array(times), (np.array(column) for column in zip(*views[small]))
-    again = repeated(at, differences, np.array(same))
+    usual = float(np.median(widths or [np.inf])) / min(SEARCH_SIDE, max(media.width, media.height))
+    of_cuts, of_repeats = views[usual < SMALL_FACE], views[usual < NEARLY_SMALL * SMALL_FACE]
+    at, differences = np.array(times), np.array([change for change, _ in of_cuts])
+    again = repeated(at, *(np.array(column) for column in zip(*of_repeats)))
     return at, differences, again, np.array(damaged), follower.tracklets, on_head
 
 

@@ -23,7 +23,9 @@ REASONS = (
     "corrupt",
     "duplicate",
 )
-SMALL_FACE = 0.1  # its usual width, of the picture's long side
+# The usual width of a face, of the picture's long side, below which cuts are told by its surroundings too; and times
+# that, below which repeated pictures are.
+SMALL_FACE, NEARLY_SMALL = 0.1, 2.0
 THUMBNAIL = 64  # px, long side of the grey pictures in which cuts and duplicates are looked for
 MAX_GAP_S = 0.25  # a longer time between two pictures ends a shot: nothing is known of what moved there
 MIN_SHOT_S = 0.5  # shorter shots are left out: too little to track
@@ -95,7 +97,7 @@ class Changes:
         if before is None:
             return (0.0, False), (0.0, False)
         whole = change, same = difference(grey, before[1])
-        if face is None or face[2] - face[0] >= 2 * SMALL_FACE * max(rgb.shape):
+        if face is None or face[2] - face[0] >= 1.25 * NEARLY_SMALL * SMALL_FACE * max(rgb.shape):
             return whole, whole
         nearby, alike = difference(*(thumbnail(around(picture, face)[0]) for picture in (rgb, before[0])))
         return whole, (max(change, nearby), same and alike)

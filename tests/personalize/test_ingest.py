@@ -80,7 +80,7 @@ def test_a_small_face_that_moves_in_a_still_picture_repeats_nothing() -> None:
 def test_how_closely_is_looked_is_decided_once_for_a_clip(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A face about as wide as the limit, whose box flickers about it."""
+    """By how wide the face usually is: cuts of small ones, repeated pictures of somewhat larger ones too."""
     path = write_video(tmp_path / "clip.mkv", moving(60), [i / 25 for i in range(60)])
     looked: list[np.ndarray] = []
     monkeypatch.setattr(
@@ -89,7 +89,10 @@ def test_how_closely_is_looked_is_decided_once_for_a_clip(
     monkeypatch.setattr(
         "personalize.ingest.repeated", lambda time, change, same: looked.append(change) or same
     )
-    for width, change in ((9.0, 5.0), (11.0, 1.0)):  # of 96 px
+    monkeypatch.setattr(
+        "personalize.ingest.find_shots", lambda time, change: looked.append(change) or np.zeros(60, np.int32)
+    )
+    for width, repeats, cuts in ((9.0, 5.0, 5.0), (12.0, 5.0, 1.0), (24.0, 1.0, 1.0)):  # of 96 px
         face = tracklet(1, range(60))
         for shape in face.shapes:
             shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [60, 0]
@@ -98,7 +101,7 @@ def test_how_closely_is_looked_is_decided_once_for_a_clip(
         followed = Mock(tracklets=[face], widest=None)
         monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _, followed=followed: followed)
         find_usable(probe(path))
-        assert set(looked.pop()) == {change}
+        assert (set(looked.pop()), set(looked.pop())) == ({cuts}, {repeats})
 
 
 @pytest.mark.parametrize(
