@@ -188,7 +188,7 @@ def _check_upright(media: MediaInfo, person: list[Tracklet], on_head: Sequence[b
             raise UserError(
                 f"{media.path}: the picture lies on its side, no upright face is in it; turn the video"
             )
-    if np.mean([*on_head, False]) > MOST_ON_HEAD:
+    if np.mean([*on_head, False]) > MOST_ON_HEAD:  # four looks at least
         raise UserError(f"{media.path}: the picture is upside down; turn the video")
 
 
@@ -217,8 +217,11 @@ def _looked_through(
             progress(min(len(rows), expected), expected)
     times, *views, damaged = zip(*rows)
     # Once for the clip: two measures side by side would look like motion and rest.
-    widths = [sighting.box[2] - sighting.box[0] for face in follower.tracklets for sighting in face.sightings]
-    usual = float(np.median(widths or [np.inf])) / min(SEARCH_SIDE, max(media.width, media.height))
+    widths = np.zeros(len(times))
+    for sighting in (sighting for face in follower.tracklets for sighting in face.sightings):
+        widths[sighting.frame] = max(widths[sighting.frame], sighting.box[2] - sighting.box[0])
+    side = min(SEARCH_SIDE, max(media.width, media.height))
+    usual = float(np.median(widths[widths > 0])) / side if widths.any() else np.inf
     of_cuts, of_repeats = views[usual < SMALL_FACE], views[usual < NEARLY_SMALL * SMALL_FACE]
     at, differences = np.array(times), np.array([change for change, _ in of_cuts])
     again = repeated(at, *(np.array(column) for column in zip(*of_repeats)))

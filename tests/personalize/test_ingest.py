@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -28,12 +29,26 @@ from personalize.split import make_split
 from tests.personalize.video_factory import RATE, clicks, moving, write_video
 from tracker.face_detector import Face
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
+from tracker.track import F32
 
 
 def frames_of(time: np.ndarray, usable: np.ndarray, segment: np.ndarray | None = None) -> Frames:
     shots = np.zeros(len(time), np.int32) if segment is None else segment.astype(np.int32)
     box = np.zeros((len(time), 4), np.float32)
     return Frames(time, usable, (~usable).astype(np.uint8), REASONS, shots, box)
+
+
+def follow_one(
+    monkeypatch: pytest.MonkeyPatch,
+    face: Tracklet,
+    across: Sequence[float] = (60, 0),
+    widest: F32 | None = None,
+) -> None:
+    """Let a clip show one face, whose eyes lie `across` [2] px from each other; see FaceFollower for widest."""
+    for shape in face.shapes:
+        shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + across
+    follower = Mock(tracklets=[face], widest=widest)
+    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: follower)
 
 
 def test_a_cut_is_found_where_the_change_stands_out() -> None:
@@ -94,12 +109,9 @@ def test_how_closely_is_looked_is_decided_once_for_a_clip(
     )
     for width, repeats, cuts in ((9.0, 5.0, 5.0), (12.0, 5.0, 1.0), (24.0, 1.0, 1.0)):  # of 96 px
         face = tracklet(1, range(60))
-        for shape in face.shapes:
-            shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [60, 0]
         for sighting in face.sightings:
             sighting.box[:] = (20, 20, 20 + width, 40)
-        followed = Mock(tracklets=[face], widest=None)
-        monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _, followed=followed: followed)
+        follow_one(monkeypatch, face)
         find_usable(probe(path))
         assert (set(looked.pop()), set(looked.pop())) == ({cuts}, {repeats})
 
@@ -240,11 +252,8 @@ def test_a_face_that_lies_on_its_side_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tilt_deg: float, refused: bool
 ) -> None:
     path = write_video(tmp_path / "clip.mkv", moving(20), [i / 25 for i in range(20)])
-    face = tracklet(1, range(20))
     angle = np.radians(tilt_deg)
-    for shape in face.shapes:
-        shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + 60 * np.array([np.cos(angle), np.sin(angle)])
-    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: Mock(tracklets=[face], widest=None))
+    follow_one(monkeypatch, tracklet(1, range(20)), 60 * np.array([np.cos(angle), np.sin(angle)]))
     if refused:
         with pytest.raises(UserError, match="on its side"):
             find_usable(probe(path))
@@ -270,11 +279,8 @@ def test_a_picture_that_is_upside_down_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: bool
 ) -> None:
     path = write_video(tmp_path / "clip.mkv", moving(60), [i / 25 for i in range(60)])
-    face = tracklet(1, range(60))
-    for shape in face.shapes:
-        shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [60, 0]
-    followed = Mock(tracklets=[face], widest=np.array([20, 20, 40, 40], np.float32))
-    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: followed)
+    box = np.array([20, 20, 40, 40], np.float32)
+    follow_one(monkeypatch, tracklet(1, range(60)), [60, 0], box)
     # One look of several errs.
     looks = iter([not refused, *[refused] * 9])
     monkeypatch.setattr("personalize.ingest.TURN_S", 0.25)
@@ -290,11 +296,8 @@ def test_a_head_on_its_side_is_told_so_whatever_the_detector_finds_surer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_video(tmp_path / "clip.mkv", moving(60), [i / 25 for i in range(60)])
-    face = tracklet(1, range(60))
-    for shape in face.shapes:
-        shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [0, 60]
-    followed = Mock(tracklets=[face], widest=np.array([20, 20, 40, 40], np.float32))
-    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: followed)
+    box = np.array([20, 20, 40, 40], np.float32)
+    follow_one(monkeypatch, tracklet(1, range(60)), [0, 60], box)
     monkeypatch.setattr("personalize.ingest.stands_on_head", lambda *_: True)
     with pytest.raises(UserError, match="lies on its side"):
         find_usable(probe(path))
@@ -334,9 +337,7 @@ def test_too_much_light_is_told_as_too_little_is(
 ) -> None:
     path = write_video(tmp_path / "clip.mkv", moving(20), [i / 25 for i in range(20)])
     face = tracklet(1, range(20), light=light, burnt=burnt)
-    for shape in face.shapes:
-        shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + [60, 0]
-    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: Mock(tracklets=[face], widest=None))
+    follow_one(monkeypatch, face)
     frames, warnings = find_usable(probe(path))
     assert {frames.reasons[index] for index in frames.reason[1:]} == {reason}
     assert (said in " ".join(warnings)) if said else not any("face is" in text for text in warnings)
