@@ -56,7 +56,9 @@ class MediaInfo:
 
 
 class Source:
-    """An opened container with its first `video` and `audio` streams (None where there is none).
+    """An opened container with its first `video` and `audio` streams that can be decoded (None where there is none).
+
+    A phone may put sound of a format of its own before, or behind, one that others can read.
 
     It reads through one file handle with no protocols allowed, so that a playlist cannot open other files.
     """
@@ -72,8 +74,8 @@ class Source:
             reason = str(getattr(error, "strerror", None) or error).splitlines()[0]
             raise UserError(f"{path}: not a video that can be read ({reason}); is it complete?") from None
         streams = self.container.streams
-        self.video: Any = next((s for s in streams.video if not _is_cover(s)), None)
-        self.audio: Any = next(iter(streams.audio), None)
+        self.video: Any = next((s for s in streams.video if _is_known(s) and not _is_cover(s)), None)
+        self.audio: Any = next((s for s in streams.audio if _is_known(s)), None)
 
     def __enter__(self) -> Source:
         return self
@@ -113,6 +115,11 @@ def _open_file(path: Path) -> BinaryIO:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
+def _is_known(stream: Any) -> bool:
+    """Whether FFmpeg knows how a stream is coded."""
+    return stream.codec_context is not None
+
+
 def _is_cover(stream: Any) -> bool:
     """Whether a video stream is only the cover picture of a sound file."""
     return bool(stream.disposition & av.stream.Disposition.attached_pic)
@@ -150,7 +157,9 @@ def probe(path: Path | str) -> MediaInfo:
     with Source(path) as source:
         video, audio = source.video, source.audio
         if video is None:
-            raise UserError(f"{path}: no picture in this file, only sound; give a video of a talking face")
+            raise UserError(
+                f"{path}: no picture that can be read, only sound; give a video of a talking face"
+            )
         if max(video.width, video.height) > MAX_SIDE_PX:
             raise UserError(
                 f"{path}: {video.width}x{video.height} px; scale it to at most {MAX_SIDE_PX} px a side"

@@ -107,7 +107,7 @@ def ingest_video(path: Path | str, progress: Progress = None) -> Ingested:
 def _read_sound(media: MediaInfo) -> tuple[F32, float]:
     if not media.has_audio:
         raise UserError(
-            f"{media.path}: there is no sound in this file; give a video with the person's speech"
+            f"{media.path}: there is no sound that can be read in this file; give a video with the person's speech"
         )
     samples, start = read_audio(media.path)
     if not len(samples) or float(np.abs(samples).max()) < SILENCE:

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from personalize.container import MAX_DURATION_S, Source, display_matrix, frame_time, probe, square_size
 from personalize.errors import UserError
+from personalize.hdr import HLG, PQ, usual_range
 
 U8 = NDArray[np.uint8]
 
 # A damaged picture spoils those predicted from it: up to the next key frame, or this long.
 DAMAGE_S = 5.0
 MOST_SET_BACK = 50  # pictures in a row whose time stamps lie before what was shown: more are not broken ones
-_UNSPECIFIED_COLOUR, _BT709 = 2, 1  # FFmpeg's numbers of colour spaces
+_UNSPECIFIED_COLOUR, _BT709, _BT2020 = 2, 1, 9  # FFmpeg's numbers of colour spaces
 AHEAD = 2  # pictures that are decoded while one is used
 Item = TypeVar("Item")
 
@@ -72,18 +73,23 @@ class FrameReader(Iterator[tuple[float, U8]]):
 
     def _to_rgb(self, frame: Any, size: tuple[int, int]) -> U8:
         """Any pixel format to [height, width, 3] u8 at `size` (width, height), as stored."""
-        # HD that does not name its colours is BT.709 by convention; FFmpeg would take BT.601.
-        hd = frame.colorspace == _UNSPECIFIED_COLOUR and frame.height >= 720
+        high = frame.color_trc in (HLG, PQ)
+        colours = None
+        if frame.colorspace == _UNSPECIFIED_COLOUR:
+            # HD that does not name its colours is BT.709 by convention; FFmpeg would take BT.601.
+            colours = _BT2020 if high else _BT709 if frame.height >= 720 else None
         rgb = self._reformatter.reformat(
             frame,
             width=size[0],
             height=size[1],
-            format="rgb24",
+            format="gbrp16le" if high else "rgb24",
             threads=1,
             interpolation="AREA" if frame.width > size[0] else "BICUBIC",
-            src_colorspace=_BT709 if hd else None,
-        )
-        return np.asarray(rgb.to_ndarray(), np.uint8)
+            src_colorspace=colours,
+        ).to_ndarray()
+        if high:
+            return usual_range(np.asarray(rgb, np.uint16), frame.color_trc)
+        return np.asarray(rgb, np.uint8)
 
 
 def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:

@@ -52,7 +52,7 @@ def speech_model_assets(settings: Settings) -> dict[str, str]:
 class Ingest(Stage):
     """Video -> times, usable frames and why not, sound, split."""
 
-    name, version, needs = "ingest", 7, (VIDEO,)
+    name, version, needs = "ingest", 8, (VIDEO,)
     makes = ("media.json", "frames.npz", "audio.wav", "split.json")
 
     def make(self, context: Context, folder: Path) -> None:

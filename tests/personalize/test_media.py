@@ -142,6 +142,42 @@ def test_video_without_sound_gives_none(tmp_path: Path) -> None:
     assert not probe(path).has_audio and len(read_audio(path)[0]) == 0
 
 
+def _with_two_sounds(path: Path, unknown: int) -> Path:
+    """Twice the same sound, of which `unknown`, counted from 0, is of a format that nobody knows."""
+    source = write_video(path.with_name("one.mov"), moving(25), STEADY, clicks([0.5], 1.0))
+    with av.open(str(source)) as whole, av.open(str(path), "w") as out:
+        streams = [out.add_stream_from_template(whole.streams[index]) for index in (0, 1, 1)]
+        for packet in whole.demux():
+            if packet.dts is None:
+                continue
+            if packet.stream.type == "audio":
+                again = av.Packet(bytes(packet))
+                again.pts, again.dts, again.time_base = packet.pts, packet.dts, packet.time_base
+                again.stream = streams[2]
+                out.mux(again)
+            packet.stream = streams[packet.stream.index]
+            out.mux(packet)
+    before, *entries = path.read_bytes().split(b"sowt")
+    assert len(entries) == 2
+    names = [b"what" if index == unknown else b"sowt" for index in range(2)]
+    path.write_bytes(before + names[0] + entries[0] + names[1] + entries[1])
+    return path
+
+
+@pytest.mark.parametrize("unknown", [0, 1])
+def test_sound_of_an_unknown_format_beside_a_known_one(tmp_path: Path, unknown: int) -> None:
+    """Telephones write sound of all directions beside what everybody can read."""
+    path = _with_two_sounds(tmp_path / "v.mov", unknown)
+    assert probe(path).has_audio and probe(path).audio_codec == "pcm_s16le"
+    assert click_times(*read_audio(path)) == pytest.approx([0.5], abs=3e-3)
+
+
+def test_sound_of_an_unknown_format_alone_is_none(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "v.mov", moving(25), STEADY, clicks([0.5], 1.0))
+    path.write_bytes(path.read_bytes().replace(b"sowt", b"what"))
+    assert not probe(path).has_audio and len(read_audio(path)[0]) == 0
+
+
 def test_wav_keeps_its_samples(tmp_path: Path) -> None:
     samples = np.linspace(-1, 1, 1000, dtype=np.float32)
     write_wav(tmp_path / "a.wav", samples)
