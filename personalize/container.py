@@ -157,9 +157,7 @@ def probe(path: Path | str) -> MediaInfo:
     with Source(path) as source:
         video, audio = source.video, source.audio
         if video is None:
-            raise UserError(
-                f"{path}: no picture that can be read, only sound; give a video of a talking face"
-            )
+            raise UserError(f"{path}: no picture in it that can be read; give a video of a talking face")
         if max(video.width, video.height) > MAX_SIDE_PX:
             raise UserError(
                 f"{path}: {video.width}x{video.height} px; scale it to at most {MAX_SIDE_PX} px a side"

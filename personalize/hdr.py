@@ -29,10 +29,18 @@ TO_BT709 = np.array(
 KNEE = 0.8  # of a usual picture's range: what is brighter is pressed together below 1
 MOST = 50.0  # times white: PQ ends there
 LEVELS = 1 << 16
+ROWS = 64  # of a picture, taken at once: what lies between is small enough for the processor's cache
 
 
 def usual_range(rgb: U16, transfer: int) -> U8:
     """A picture [H, W, 3] u16, BT.2020 by the transfer function PQ or HLG, as one of usual range, BT.709."""
+    out = np.empty(rgb.shape, np.uint8)
+    for top in range(0, len(rgb), ROWS):
+        out[top : top + ROWS] = _shown(rgb[top : top + ROWS], transfer)
+    return out
+
+
+def _shown(rgb: U16, transfer: int) -> U8:
     light, written = _tables(transfer)
     shown = cv2.LUT(np.ascontiguousarray(rgb), light)
     if transfer == HLG:

@@ -218,6 +218,9 @@ def test_what_is_no_video_is_refused_in_one_line(tmp_path: Path) -> None:
     write_wav(tmp_path / "sound.wav", clicks([0.1], 1.0), RATE)
     whole = write_video(tmp_path / "whole.mp4", moving(25), STEADY)
     (tmp_path / "cut.mp4").write_bytes(whole.read_bytes()[:600])
+    (tmp_path / "unknown.mp4").write_bytes(
+        whole.read_bytes().replace(b"avc1", b"what").replace(b"avcC", b"whaC")
+    )
     playlist = f"#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\n{whole}\n#EXT-X-ENDLIST\n"
     cases = {
         tmp_path / "missing.mp4": "no such file",
@@ -226,7 +229,8 @@ def test_what_is_no_video_is_refused_in_one_line(tmp_path: Path) -> None:
         _text(tmp_path / "text.mp4", "not a video"): "not a video",
         _text(tmp_path / "list.m3u8", playlist): "not a video",
         tmp_path / "cut.mp4": "not a video",
-        tmp_path / "sound.wav": "only sound",
+        tmp_path / "sound.wav": "no picture in it",
+        tmp_path / "unknown.mp4": "no picture in it",
         _still(tmp_path / "still.png"): "still picture",
         write_video(tmp_path / "one.mp4", moving(1), [0.0]): "only one picture",
     }
