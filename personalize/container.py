@@ -56,9 +56,10 @@ class MediaInfo:
 
 
 class Source:
-    """An opened container with its first `video` and `audio` streams that can be decoded (None where there is none).
+    """An opened container: of what can be decoded its `video` stream, None where there is none, and its `sounds`.
 
-    A phone may put sound of a format of its own before, or behind, one that others can read.
+    Of several video streams it is the one that players show, or the largest. A phone may put sound of a format of its
+    own before, or behind, one that others can read.
 
     It reads through one file handle with no protocols allowed, so that a playlist cannot open other files.
     """
@@ -74,8 +75,11 @@ class Source:
             reason = str(getattr(error, "strerror", None) or error).splitlines()[0]
             raise UserError(f"{path}: not a video that can be read ({reason}); is it complete?") from None
         streams = self.container.streams
-        self.video: Any = next((s for s in streams.video if _is_known(s) and not _is_cover(s)), None)
-        self.audio: Any = next((s for s in streams.audio if _is_known(s)), None)
+        shown = [s for s in streams.video if _is_known(s) and not _is_cover(s)]
+        self.video: Any = max(shown, key=_prominence, default=None)
+        self.sounds: list[Any] = [s for s in streams.audio if _is_known(s)]
+        self._guesses = self.container.format.name == "avi"
+        self._late: int | None = None
 
     def __enter__(self) -> Source:
         return self
@@ -96,9 +100,24 @@ class Source:
             except (StopIteration, av.FFmpegError):
                 return
             try:
-                yield from packet.decode()
+                frames = packet.decode()
             except av.FFmpegError:
                 continue
+            for frame in frames:
+                if self._guesses and stream is self.video:
+                    self._as_stored(frame)
+                yield frame
+
+    def _as_stored(self, frame: Any) -> None:
+        """Give a picture the time at which it is stored, from the first one's on.
+
+        AVI knows no other. FFmpeg guesses when pictures are shown that are stored in another order, and is wrong.
+        """
+        if frame.dts is None:
+            frame.pts = None
+            return
+        self._late = frame.dts - (frame.pts or 0) if self._late is None else self._late
+        frame.pts = frame.dts - self._late
 
 
 def _open_file(path: Path) -> BinaryIO:
@@ -123,6 +142,11 @@ def _is_known(stream: Any) -> bool:
 def _is_cover(stream: Any) -> bool:
     """Whether a video stream is only the cover picture of a sound file."""
     return bool(stream.disposition & av.stream.Disposition.attached_pic)
+
+
+def _prominence(stream: Any) -> tuple[bool, int]:
+    """By default shown, and area in px: of a video stream."""
+    return bool(stream.disposition & av.stream.Disposition.default), stream.width * stream.height
 
 
 def frame_time(frame: Any, fallback: float) -> float:
@@ -155,7 +179,7 @@ def probe(path: Path | str) -> MediaInfo:
     """
     path = Path(path)
     with Source(path) as source:
-        video, audio = source.video, source.audio
+        video, audio = source.video, next(iter(source.sounds), None)
         if video is None:
             raise UserError(f"{path}: no picture in it that can be read; give a video of a talking face")
         if max(video.width, video.height) > MAX_SIDE_PX:

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from personalize.container import MediaInfo, probe
 from personalize.errors import UserError
 from personalize.people import FaceFollower, Tracklet, main_person, stands_on_head
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader, read_frames
 from personalize.shots import (
     CUT_WINDOW_S,
     F32,
     F64,
     MAX_GAP_S,
     MIN_SHOT_S,
+    MOST_WINDOW,
     NEARLY_SMALL,
     REASONS,
     SMALL_FACE,
@@ -54,6 +55,7 @@ TURN_S = 1.0  # between looks whether the picture is upside down
 MOST_ON_HEAD = 0.75  # share of the looks: upright clips have .2 at most
 SILENCE = 1e-3  # peak of the sound, -60 dB
 MOST_SILENT_S = 1.0  # of pictures before the sound begins or after it ends
+MOST_INTERLACED = 0.5  # share of the pictures
 MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it for no longer
 
 DESCRIPTIONS = {
@@ -131,7 +133,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
 
     In one pass: a cut is told by the pictures behind it too, so what was followed across one is divided afterwards.
     """
-    time, change, again, corrupt, faces, on_head = _looked_through(media, progress)
+    time, change, again, corrupt, faces, on_head, notes = _looked_through(media, progress)
     _check_rate(media, time[~again])
     segment = find_shots(time, change)
     mine, others = main_person([shot for face in faces for shot in face.shots(segment)])
@@ -161,7 +163,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     for name, marked in marks.items():  # the last that applies stays
         reason[marked] = REASONS.index(name)
     frames = Frames(time, reason == 0, reason, REASONS, segment, box.astype(np.float32))
-    return frames, _lost_in_file(media, time) + _warnings(frames, eyes, light, burnt)
+    return frames, notes + _lost_in_file(media, time) + _warnings(frames, eyes, light, burnt)
 
 
 def _check_rate(media: MediaInfo, changed: F64) -> None:
@@ -194,15 +196,15 @@ def _check_upright(media: MediaInfo, person: list[Tracklet], on_head: Sequence[b
 
 def _looked_through(
     media: MediaInfo, progress: Progress
-) -> tuple[F64, F64, Bool, Bool, list[Tracklet], list[bool]]:
+) -> tuple[F64, F64, Bool, Bool, list[Tracklet], list[bool], list[str]]:
     """Times [T] s, how much each picture differs from the last [T], repeated [T], damaged [T]; every face; heads down.
 
-    Faces are in pixels of a picture of at most SEARCH_SIDE.
+    Faces are in pixels of a picture of at most SEARCH_SIDE. Last, what the person should know of the pictures' form.
     """
     landmarker = FaceLandmarker()
     reader, follower = read_frames(media.path, SEARCH_SIDE), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
-    recent = deque[float](maxlen=max(3, round(CUT_WINDOW_S * media.fps)))
+    recent = deque[float](maxlen=min(max(3, round(CUT_WINDOW_S * media.fps)), MOST_WINDOW))
     changes, rows, on_head, next_look = Changes(), [], list[bool](), 0.0
     for index, (time, rgb) in enumerate(reader):
         whole, near = changes.next(rgb, follower.widest)
@@ -225,7 +227,30 @@ def _looked_through(
     of_cuts, of_repeats = views[usual < SMALL_FACE], views[usual < NEARLY_SMALL * SMALL_FACE]
     at, differences = np.array(times), np.array([change for change, _ in of_cuts])
     again = repeated(at, *(np.array(column) for column in zip(*of_repeats)))
-    return at, differences, again, np.array(damaged), follower.tracklets, on_head
+    return (
+        at,
+        differences,
+        again,
+        np.array(damaged),
+        follower.tracklets,
+        on_head,
+        _form(media, reader, len(at)),
+    )
+
+
+def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:
+    """Pictures whose size changes, or that are woven of two fields."""
+    texts = []
+    if not np.isnan(reader.resized_s):
+        texts.append(
+            f"the size of the pictures changes at {reader.resized_s:.1f} s; all are taken at the first one's, "
+            f"{media.width}x{media.height} px: if most are larger, give the part behind"
+        )
+    if reader.interlaced > MOST_INTERLACED * total:
+        texts.append(
+            "the film is interlaced: lips may be measured a third less well; set the camera to progressive pictures"
+        )
+    return texts
 
 
 def _filled(tracklet: Tracklet, time: F64) -> F64:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,6 +23,15 @@ U8 = NDArray[np.uint8]
 DAMAGE_S = 5.0
 MOST_SET_BACK = 50  # pictures in a row whose time stamps lie before what was shown: more are not broken ones
 _UNSPECIFIED_COLOUR, _BT709, _BT2020 = 2, 1, 9  # FFmpeg's numbers of colour spaces
+_BT2020_LIKE = (
+    10,
+    12,
+    13,
+)  # of its primaries, nearly or in all; FFmpeg cannot take them to red, green and blue
+_UNKNOWN_COLOURS = {8: "YCgCo", 14: "ICtCp"}
+OTHER_SHAPE = (
+    0.02  # by which width over height may differ from the first picture's: codecs crop by whole blocks
+)
 AHEAD = 2  # pictures that are decoded while one is used
 Item = TypeVar("Item")
 
@@ -32,8 +40,10 @@ class FrameReader(Iterator[tuple[float, U8]]):
     """Pictures of a video in order: (time s from the first picture, rgb [H, W, 3] u8 with square pixels).
 
     Times are strictly rising. After each step `damaged` says whether that picture was decoded from broken
-    data or predicted from such a picture; pictures that do not decode at all are missing. Every pass over a
-    file gives the same pictures. Raises UserError like `probe`, beyond the limits, and where the clock is set back.
+    data or predicted from such a picture; pictures that do not decode at all are missing. `interlaced`: how many were
+    of two fields. `resized_s`: when their size first changed, s; NaN if it did not. Every pass over a file gives the
+    same pictures. Raises UserError like `probe`, beyond the limits, where the clock is set back, where the pictures'
+    shape changes, and of colours that FFmpeg cannot read.
     """
 
     def __init__(self, path: Path | str, max_side: int | None = None) -> None:
@@ -42,6 +52,7 @@ class FrameReader(Iterator[tuple[float, U8]]):
         self._max_side = max_side
         self.info = probe(self._path)
         self.damaged = False
+        self.interlaced, self.resized_s = 0, float("nan")
         self._reformatter = (
             VideoReformatter()
         )  # one for all pictures: making its tables takes longer than its work
@@ -54,18 +65,32 @@ class FrameReader(Iterator[tuple[float, U8]]):
     def _read(self) -> Generator[tuple[float, U8, bool]]:
         """Time, picture, and whether it is damaged."""
         start, step = self.info.video_start_s, 1 / self.info.fps if self.info.fps else 0.04
-        damage_end, size = -1.0, (0, 0)
+        damage_end, size, whole = -1.0, (0, 0), (0, 0)
         matrix = np.eye(2, dtype=np.int64)
         with Source(self._path) as source:
             source.video.thread_type = "AUTO"
             for time, frame in _in_time(source.decode(source.video), start, step, self._path):
+                seen = square_size(source.video, frame)
                 if not size[0]:  # later pictures are scaled to the size of the first
-                    matrix, size = display_matrix(frame), self._size(*square_size(source.video, frame))
+                    matrix, size, whole = display_matrix(frame), self._size(*seen), seen
+                self._check_size(time, whole, seen)
+                self.interlaced += bool(frame.interlaced_frame)
                 if frame.is_corrupt:
                     damage_end = time + DAMAGE_S
                 elif frame.key_frame:
                     damage_end = -1.0
                 yield time, _turned(self._to_rgb(frame, size), matrix), time <= damage_end
+
+    def _check_size(self, time: float, first: tuple[int, int], now: tuple[int, int]) -> None:
+        if now == first:
+            return
+        if abs(now[0] / now[1] / (first[0] / first[1]) - 1) > OTHER_SHAPE:
+            raise UserError(
+                f"{self._path}: the picture's shape changes at {time:.1f} s, from {first[0]}x{first[1]} to "
+                f"{now[0]}x{now[1]} px, as where a telephone is turned; give the part before or after"
+            )
+        if not self.resized_s <= time:
+            self.resized_s = time
 
     def _size(self, width: int, height: int) -> tuple[int, int]:
         scale = min(1.0, self._max_side / max(width, height)) if self._max_side else 1.0
@@ -75,9 +100,16 @@ class FrameReader(Iterator[tuple[float, U8]]):
         """Any pixel format to [height, width, 3] u8 at `size` (width, height), as stored."""
         high = frame.color_trc in (HLG, PQ)
         colours = None
+        if frame.colorspace in _UNKNOWN_COLOURS:
+            name = _UNKNOWN_COLOURS[frame.colorspace]
+            raise UserError(
+                f"{self._path}: its colours are {name}, which cannot be read; export it as usual video"
+            )
         if frame.colorspace == _UNSPECIFIED_COLOUR:
             # HD that does not name its colours is BT.709 by convention; FFmpeg would take BT.601.
             colours = _BT2020 if high else _BT709 if frame.height >= 720 else None
+        elif frame.colorspace in _BT2020_LIKE:
+            colours = _BT2020
         rgb = self._reformatter.reformat(
             frame,
             width=size[0],
@@ -100,11 +132,13 @@ def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:
 def _in_time(frames: Iterable[Any], start: float, step: float, path: Path) -> Generator[tuple[float, Any]]:
     """Those of a stream's frames that lie behind all before them: their times, s after `start`, and they themselves.
 
-    step: s, from a frame to one without a time. Raises UserError beyond the limit and where the clock is set back.
+    step: s, from the first frame to one without a time; later ones come as far behind as the two before. Raises
+    UserError beyond the limit and where the clock is set back.
     """
     before, last, set_back = -1.0, -1.0, 0
     for frame in frames:
-        time = frame_time(frame, last + step + start) - start
+        usual = last - before if before >= 0 else step
+        time = frame_time(frame, last + usual + start) - start
         if time > MAX_DURATION_S:
             raise UserError(f"{path}: over {MAX_DURATION_S / 3600:.0f} h long; cut it")
         if time > last:
@@ -120,14 +154,19 @@ def _in_time(frames: Iterable[Any], start: float, step: float, path: Path) -> Ge
             )
 
 
-def _ahead(items: Generator[Item]) -> Iterator[Item]:
+def _ahead(items: Iterator[Item]) -> Generator[Item]:
     """The same items, of which the next are made by a thread while one is used."""
     end: Any = object()
-    with closing(items), ThreadPoolExecutor(1) as thread:
+    thread = ThreadPoolExecutor(1)
+    try:
         coming = deque(thread.submit(next, items, end) for _ in range(AHEAD))
         while (item := coming.popleft().result()) is not end:
             coming.append(thread.submit(next, items, end))
             yield item
+    finally:
+        # Not waited for: a reader that is left is ended by the garbage collector, in whatever thread and under whatever
+        # lock, that of threads which begin and end among them.
+        thread.shutdown(wait=False, cancel_futures=True)
 
 
 def _turned(picture: U8, matrix: NDArray[np.int64]) -> U8:

@@ -18,31 +18,44 @@ F32 = NDArray[np.float32]
 AUDIO_RATE = 16_000
 # Sound is placed anew where its times leave the running count by more. Some containers round times to 1 ms.
 GAP_S = 0.01
+# Of the loudest channel: a mean that is quieter holds channels of opposite sign, or silent ones for the most part.
+CANCELLED = 0.3
 
 
 def read_audio(path: Path | str, rate: int = AUDIO_RATE) -> tuple[F32, float]:
     """Sound as (mono samples [S] f32 -1..1 at `rate` Hz, time s of the first sample from the first picture).
 
-    Every packet lies at its presentation time: gaps are silence, a late start is kept. S is 0 without a sound
-    stream, or when nothing in it decodes. In a pure sound file times start at 0. Raises UserError like
-    `Source`.
+    Every packet lies at its presentation time: gaps are silence, a late start is kept. Of several sound streams it is
+    the loudest. S is 0 without one, or when nothing in it decodes. In a pure sound file times start at 0. Raises
+    UserError like `Source`.
     """
     path = Path(path)
     origin = _picture_start(path)
+    with Source(path) as source:
+        count = len(source.sounds)
+    tracks = [_placed(_runs(path, number, origin, rate), rate) for number in range(count)]
+    return max(tracks, key=lambda track: _loudness(track[0]), default=_placed([], rate))
+
+
+def _runs(path: Path, number: int, origin: float, rate: int) -> list[tuple[float, F32]]:
+    """The uninterrupted stretches of one of a file's sounds: s after `origin`, and samples."""
     runs: list[tuple[float, F32]] = []
     with Source(path) as source:
-        frames = source.decode(source.audio) if source.audio is not None else iter(())
         run: _Run | None = None
-        for frame in frames:
+        for frame in source.decode(source.sounds[number]):
             time = frame_time(frame, run.end if run else origin)
-            if run is None or abs(time - run.end) > GAP_S:
+            if run is None or abs(time - run.end) > GAP_S or not run.goes_on(frame):
                 runs += [run.close()] if run else []
                 run = _Run(rate, time)
             run.add(frame)
             if run.end - origin > MAX_DURATION_S:
                 raise UserError(f"{path}: over {MAX_DURATION_S / 3600:.0f} h of sound; cut it")
         runs += [run.close()] if run else []
-    runs = [(start - origin, part) for start, part in runs if len(part)]
+    return [(start - origin, part) for start, part in runs if len(part)]
+
+
+def _placed(runs: list[tuple[float, F32]], rate: int) -> tuple[F32, float]:
+    """All stretches in one, silence between them, and when it begins, s."""
     if not runs:
         return np.zeros(0, np.float32), 0.0
     first = min(start for start, _ in runs)
@@ -51,6 +64,18 @@ def read_audio(path: Path | str, rate: int = AUDIO_RATE) -> tuple[F32, float]:
     for place, part in placed:
         samples[place : place + len(part)] = part
     return samples, first
+
+
+def _loudness(samples: F32) -> float:
+    """Root mean square of [.., S]; 0 of none."""
+    return float(np.sqrt(np.square(samples).mean())) if samples.size else 0.0
+
+
+def _one_channel(channels: F32) -> F32:
+    """[C, S] -> [S]: their mean, or the loudest where they cancel each other, or one of many speaks."""
+    mean = np.asarray(channels.mean(0), np.float32)
+    loudest = channels[int(np.argmax([_loudness(channel) for channel in channels]))]
+    return mean if _loudness(mean) > CANCELLED * _loudness(loudest) else loudest
 
 
 def _picture_start(path: Path) -> float:
@@ -64,22 +89,33 @@ class _Run:
     """Resamples one uninterrupted stretch of sound to mono; `end` is the container time it reaches, s."""
 
     def __init__(self, rate: int, start: float) -> None:
-        self._resampler = av.AudioResampler(format="flt", layout="mono", rate=rate)
+        # The channels as they are: FFmpeg's own mixing makes what both of them hold louder than either, and clips.
+        self._resampler = av.AudioResampler(format="fltp", rate=rate)
         self._parts: list[F32] = []
+        self._kind: tuple[str, str, int] | None = None
         self._start = start
         self.end = start
 
+    def goes_on(self, frame: Any) -> bool:
+        """Whether a frame has the format of those before."""
+        return self._kind in (None, _kind(frame))
+
     def add(self, frame: Any) -> None:
+        self._kind = _kind(frame)
         self.end += frame.samples / frame.sample_rate
         frame.pts = None  # placed by the caller, not by the resampler
-        self._parts += [out.to_ndarray().ravel() for out in self._resampler.resample(frame)]
+        self._parts += [out.to_ndarray() for out in self._resampler.resample(frame)]
 
     def close(self) -> tuple[float, F32]:
         """(start on the container's clock s, samples)."""
         if not self._parts:
             return self._start, np.zeros(0, np.float32)
-        self._parts += [out.to_ndarray().ravel() for out in self._resampler.resample(None)]
-        return self._start, np.concatenate(self._parts)
+        self._parts += [out.to_ndarray() for out in self._resampler.resample(None)]
+        return self._start, _one_channel(np.concatenate(self._parts, axis=1))
+
+
+def _kind(frame: Any) -> tuple[str, str, int]:
+    return frame.format.name, frame.layout.name, frame.sample_rate
 
 
 def on_video_clock(samples: F32, start_s: float, duration_s: float, rate: int = AUDIO_RATE) -> F32:

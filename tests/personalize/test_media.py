@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import threading
 import time
+from collections.abc import Generator
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,10 +16,10 @@ import pytest
 
 from personalize.container import probe
 from personalize.errors import UserError
-from personalize.pictures import _in_time, _turned, read_frames
+from personalize.pictures import _ahead, _in_time, _turned, read_frames
 from personalize.sound import on_video_clock, read_audio, write_wav
 from personalize.video_writer import VideoWriter
-from tests.personalize.video_factory import RATE, clicks, corner_picture, moving, write_video
+from tests.personalize.video_factory import RATE, clicks, corner_picture, moving, write_sounds, write_video
 
 STEADY = [i / 25 for i in range(25)]
 
@@ -82,6 +83,23 @@ def test_a_reader_that_is_left_early_leaves_no_thread_behind(tmp_path: Path) -> 
     assert len(list(read_frames(path))) == 25 and is_alone()
 
 
+def test_a_reader_that_is_left_is_not_waited_for() -> None:
+    """The garbage collector may end it inside a thread that begins, whose lock its own thread needs to end."""
+    go, done = threading.Event(), list[int]()
+
+    def items() -> Generator[int]:
+        yield 0
+        go.wait(10)
+        done.append(1)
+        yield 1
+
+    reader = _ahead(items())
+    assert next(reader) == 0
+    reader.close()
+    assert not done
+    go.set()
+
+
 def test_pixels_that_are_not_square_are_made_so(tmp_path: Path) -> None:
     path = write_video(tmp_path / "v.mkv", moving(3), STEADY[:3], aspect=Fraction(4, 3))
     assert (probe(path).width, probe(path).height) == (128, 64)
@@ -137,6 +155,53 @@ def test_broken_time_stamps_cost_their_pictures_and_no_more(tmp_path: Path, stam
     assert len(list(_in_time(frames, 0.0, 0.04, tmp_path))) == left
 
 
+def test_pictures_stored_in_another_order_keep_their_times_in_avi(tmp_path: Path) -> None:
+    """It knows the order alone in which they are stored."""
+    path = write_video(tmp_path / "v.avi", moving(60), [i / 25 for i in range(60)], options={"bf": "3"})
+    read = list(read_frames(path))
+    assert [t for t, _ in read] == pytest.approx([i / 25 for i in range(60)], abs=2e-3)
+    assert [int(np.argmin([np.abs(p.astype(int) - q).mean() for q in moving(60)])) for _, p in read] == [
+        *range(60)
+    ]
+
+
+def _joined(folder: Path, size: tuple[int, int]) -> Path:
+    """A second of pictures of 96 x 64 px, and one of those of another size (width, height)."""
+    parts = [
+        write_video(folder / f"{start}.ts", [corner_picture(*shape)] * 25, [start + t for t in STEADY])
+        for start, shape in enumerate([(96, 64), size])
+    ]
+    path = folder / "joined.ts"
+    path.write_bytes(b"".join(part.read_bytes() for part in parts))
+    return path
+
+
+def test_pictures_that_change_their_shape_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"shape changes at 1\.0 s, from 96x64 to 64x96 px"):
+        list(read_frames(_joined(tmp_path, (64, 96))))
+
+
+def test_pictures_that_change_their_size_are_told(tmp_path: Path) -> None:
+    reader = read_frames(_joined(tmp_path, (192, 128)))
+    assert {picture.shape for _, picture in reader} == {(64, 96, 3)}
+    assert reader.resized_s == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("flags", "woven"), [("", 0), ("+ildct+ilme", 25)])
+def test_interlaced_pictures_are_counted(tmp_path: Path, flags: str, woven: int) -> None:
+    reader = read_frames(
+        write_video(tmp_path / "v.mkv", moving(25), STEADY, options={"flags": flags} if flags else {})
+    )
+    assert len(list(reader)) == 25 and reader.interlaced == woven and np.isnan(reader.resized_s)
+
+
+@pytest.mark.parametrize("colours", [8, 14])
+def test_colours_that_cannot_be_read_are_named(tmp_path: Path, colours: int) -> None:
+    path = write_video(tmp_path / "v.mp4", moving(3), STEADY[:3], colours=colours)
+    with pytest.raises(UserError, match=r"its colours are (YCgCo|ICtCp)"):
+        list(read_frames(path))
+
+
 def test_video_without_sound_gives_none(tmp_path: Path) -> None:
     path = write_video(tmp_path / "v.mp4", moving(5), STEADY[:5])
     assert not probe(path).has_audio and len(read_audio(path)[0]) == 0
@@ -170,6 +235,32 @@ def test_sound_of_an_unknown_format_beside_a_known_one(tmp_path: Path, unknown: 
     path = _with_two_sounds(tmp_path / "v.mov", unknown)
     assert probe(path).has_audio and probe(path).audio_codec == "pcm_s16le"
     assert click_times(*read_audio(path)) == pytest.approx([0.5], abs=3e-3)
+
+
+def test_channels_are_neither_added_nor_cancelled(tmp_path: Path) -> None:
+    tone = clicks([0.2, 0.7], 1.0)
+    peak = float(np.abs(read_audio(write_sounds(tmp_path / "mono.mkv", [tone[None]]))[0]).max())
+    for name, channels in {"same": [tone, tone], "opposite": [tone, -tone], "one": [0 * tone, tone]}.items():
+        samples, start = read_audio(write_sounds(tmp_path / f"{name}.mkv", [np.stack(channels)]))
+        assert np.abs(samples).max() == pytest.approx(peak / 2 if name == "one" else peak, rel=0.1)
+        assert click_times(samples / np.abs(samples).max(), start) == pytest.approx([0.2, 0.7], abs=0.01)
+
+
+def test_of_several_sounds_the_loudest_is_taken(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).normal(0, 1e-3, RATE).astype(np.float32)
+    path = write_sounds(tmp_path / "two.mkv", [noise[None], clicks([0.5], 1.0)[None]])
+    assert click_times(*read_audio(path)) == pytest.approx([0.5], abs=0.01)
+
+
+def test_sound_whose_rate_and_channels_change(tmp_path: Path) -> None:
+    tone = clicks([0.5], 1.0)
+    first = write_sounds(tmp_path / "a.ts", [tone[None]])
+    second = write_sounds(
+        tmp_path / "b.ts", [np.stack([tone, tone])[:, : RATE * 2 // 3]], rate=32_000, start=1.0
+    )
+    (tmp_path / "joined.ts").write_bytes(first.read_bytes() + second.read_bytes())
+    samples, start = read_audio(tmp_path / "joined.ts")
+    assert len(click_times(samples, start)) == 2
 
 
 def test_sound_of_an_unknown_format_alone_is_none(tmp_path: Path) -> None:

@@ -46,10 +46,17 @@ def write_video(
     codec: str = "libx264",
     pixels: str = "yuv420p",
     keys: int = 250,
+    options: dict[str, str] | None = None,
+    colours: int | None = None,
 ) -> Path:
-    """Pictures at `times` s; sound from `sound_start`, without the packets that begin inside `sound_gap`."""
+    """Pictures at `times` s; sound from `sound_start`, without the packets that begin inside `sound_gap`.
+
+    options: of the encoder. colours: FFmpeg's number of the colour space that the film is said to have.
+    """
     with av.open(str(path), "w") as out:
-        video: Any = out.add_stream(codec, rate=25, options={"g": str(keys), "crf": "12"})
+        video: Any = out.add_stream(codec, rate=25, options={"g": str(keys), "crf": "12", **(options or {})})
+        if colours is not None:
+            video.codec_context.colorspace = colours
         video.height, video.width = pictures[0].shape[:2]
         video.pix_fmt = pixels
         video.codec_context.time_base = MS
@@ -73,6 +80,29 @@ def write_video(
             frame.sample_rate, frame.time_base = RATE, Fraction(1, RATE)
             frame.pts = start + round(sound_start * RATE)
             out.mux(audio.encode(frame))
+    return path
+
+
+def write_sounds(
+    path: Path, sounds: Sequence[F32], rate: int = RATE, start: float = 0.0, codec: str = "mp2"
+) -> Path:
+    """Sound streams one beside another, each [C, S], of one or two channels, from `start` s on."""
+    with av.open(str(path), "w") as out:
+        streams: list[Any] = [
+            out.add_stream(codec, rate=rate, layout="mono" if len(sound) == 1 else "stereo")
+            for sound in sounds
+        ]
+        for stream, sound in zip(streams, sounds):
+            block = stream.codec_context.frame_size or 1152
+            for begin in range(0, sound.shape[1], block):
+                pcm = np.round(sound[:, begin : begin + block] * 32767).astype(np.int16)
+                frame = av.AudioFrame.from_ndarray(
+                    pcm.T.reshape(1, -1), format="s16", layout=stream.layout.name
+                )
+                frame.sample_rate, frame.time_base = rate, Fraction(1, rate)
+                frame.pts = begin + round(start * rate)
+                out.mux(stream.encode(frame))
+            out.mux(stream.encode(None))
     return path
 
 
