@@ -29,7 +29,8 @@ class MediaInfo:
     width, height: px of the upright picture with square pixels. rotation_deg: counter-clockwise turn that the
     file asks for. fps: nominal rate. duration_s: as the container states it, 0 when it does not.
     video_start_s: presentation time of the first picture on the container's clock.
-    audio_rate (Hz), audio_channels: 0 without sound. focal_mm: what the camera wrote of its lens, on film 36 mm wide;
+    audio_codec, audio_rate (Hz), audio_channels: of the first sound that
+    can be decoded, nothing without. focal_mm: what the camera wrote of its lens, on film 36 mm wide;
     0 where it wrote nothing.
     """
 

@@ -227,15 +227,8 @@ def _looked_through(
     of_cuts, of_repeats = views[usual < SMALL_FACE], views[usual < NEARLY_SMALL * SMALL_FACE]
     at, differences = np.array(times), np.array([change for change, _ in of_cuts])
     again = repeated(at, *(np.array(column) for column in zip(*of_repeats)))
-    return (
-        at,
-        differences,
-        again,
-        np.array(damaged),
-        follower.tracklets,
-        on_head,
-        _form(media, reader, len(at)),
-    )
+    notes = _form(media, reader, len(at))
+    return at, differences, again, np.array(damaged), follower.tracklets, on_head, notes
 
 
 def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:

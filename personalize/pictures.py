@@ -23,15 +23,11 @@ U8 = NDArray[np.uint8]
 DAMAGE_S = 5.0
 MOST_SET_BACK = 50  # pictures in a row whose time stamps lie before what was shown: more are not broken ones
 _UNSPECIFIED_COLOUR, _BT709, _BT2020 = 2, 1, 9  # FFmpeg's numbers of colour spaces
-_BT2020_LIKE = (
-    10,
-    12,
-    13,
-)  # of its primaries, nearly or in all; FFmpeg cannot take them to red, green and blue
+# Of BT.2020's primaries, nearly or in all; FFmpeg cannot take them to red, green and blue.
+_BT2020_LIKE = (10, 12, 13)
 _UNKNOWN_COLOURS = {8: "YCgCo", 14: "ICtCp"}
-OTHER_SHAPE = (
-    0.02  # by which width over height may differ from the first picture's: codecs crop by whole blocks
-)
+# By which width over height may differ from the first picture's: codecs crop by whole blocks.
+OTHER_SHAPE = 0.02
 AHEAD = 2  # pictures that are decoded while one is used
 Item = TypeVar("Item")
 
@@ -53,9 +49,8 @@ class FrameReader(Iterator[tuple[float, U8]]):
         self.info = probe(self._path)
         self.damaged = False
         self.interlaced, self.resized_s = 0, float("nan")
-        self._reformatter = (
-            VideoReformatter()
-        )  # one for all pictures: making its tables takes longer than its work
+        # One for all pictures: making its tables takes longer than its work.
+        self._reformatter = VideoReformatter()
         self._pictures = _ahead(self._read())
 
     def __next__(self) -> tuple[float, U8]:

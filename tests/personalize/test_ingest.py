@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 
 from personalize.container import probe
 from personalize.errors import UserError
-from personalize.ingest import MIN_USABLE_S, _without_sound, find_usable, ingest_video
+from personalize.ingest import MIN_USABLE_S, _form, _without_sound, find_usable, ingest_video
 from personalize.people import FaceFollower, Sighting, Tracklet, main_person, stands_on_head
 from personalize.shots import (
     REASONS,
@@ -49,6 +50,16 @@ def follow_one(
         shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + across
     follower = Mock(tracklets=[face], widest=widest)
     monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: follower)
+
+
+@pytest.mark.parametrize(
+    ("resized_s", "interlaced", "said"),
+    [(np.nan, 10, []), (np.nan, 20, ["interlaced"]), (1.0, 20, ["changes at 1.0 s", "interlaced"])],
+)
+def test_pictures_of_an_unusual_form_are_told(resized_s: float, interlaced: int, said: list[str]) -> None:
+    media = SimpleNamespace(width=96, height=64)
+    texts = _form(media, SimpleNamespace(resized_s=resized_s, interlaced=interlaced), 25)
+    assert len(texts) == len(said) and all(words in text for words, text in zip(said, texts))
 
 
 def test_a_cut_is_found_where_the_change_stands_out() -> None:
