@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from personalize.container import MediaInfo, probe
 from personalize.errors import UserError
-from personalize.people import FaceFollower, Tracklet, main_person, stands_on_head
+from personalize.people import FaceFollower, Tracklet, main_person, sureness_of_turns
 from personalize.pictures import FrameReader, read_frames
 from personalize.shots import (
     CUT_WINDOW_S,
@@ -51,8 +51,10 @@ MIN_LIGHT, GOOD_LIGHT = 15.0, 35.0  # mean grey level of the face
 MAX_BURNT, GOOD_BURNT = 0.5, 0.2
 MIN_SHARPNESS = 0.2  # see people.sharpness: blocky or noisy video has 0.3 to 0.6
 MAX_TILT_DEG = 60.0  # of the line of the eyes: people tilt their heads by up to 45
-TURN_S = 1.0  # between looks whether the picture is upside down
-MOST_ON_HEAD = 0.75  # share of the looks: upright clips have .2 at most
+TURN_S, TURN_LOOKS = 1.0, 4  # between looks whether the picture is turned, and the fewest that tell it
+# In so many looks a face is found more surely where the picture is turned as it should be, by so much usually: .06 at
+# least for pictures on their side, .04 at most for heads tilted by 42 degrees.
+TURN_SHARE, SURER = 0.75, 0.05
 SILENCE = 1e-3  # peak of the sound, -60 dB
 MOST_SILENT_S = 1.0  # of pictures before the sound begins or after it ends
 MOST_INTERLACED = 0.5  # share of the pictures
@@ -133,11 +135,11 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
 
     In one pass: a cut is told by the pictures behind it too, so what was followed across one is divided afterwards.
     """
-    time, change, again, corrupt, faces, on_head, notes = _looked_through(media, progress)
+    time, change, again, corrupt, faces, turns, notes = _looked_through(media, progress)
     _check_rate(media, time[~again])
     segment = find_shots(time, change)
     mine, others = main_person([shot for face in faces for shot in face.shots(segment)])
-    _check_upright(media, mine, on_head)
+    _check_upright(media, mine, turns)
     total = len(time)
     reason = np.full(total, REASONS.index("no_face"), np.uint8)
     for tracklet in others:
@@ -178,34 +180,39 @@ def _check_rate(media: MediaInfo, changed: F64) -> None:
         )
 
 
-def _check_upright(media: MediaInfo, person: list[Tracklet], on_head: Sequence[bool]) -> None:
+def _check_upright(media: MediaInfo, person: list[Tracklet], turns: list[F64]) -> None:
     """Raise UserError when the person lies on their side or head for most of the clip: the head is fitted upright.
 
-    on_head: whether they do in some of the pictures.
+    turns: [4] of some of the pictures, see `sureness_of_turns`.
     """
     across = [shape[LEFT_EYE_OUTER, :2] - shape[RIGHT_EYE_OUTER, :2] for t in person for shape in t.shapes]
-    if across:
-        tilt = np.degrees(np.arctan2(*np.transpose(across)[::-1]))
-        if float(np.median(np.abs(tilt))) > MAX_TILT_DEG:
-            raise UserError(
-                f"{media.path}: the picture lies on its side, no upright face is in it; turn the video"
-            )
-    if np.mean([*on_head, False]) > MOST_ON_HEAD:  # four looks at least
+    tilt = np.degrees(np.arctan2(*np.transpose(across)[::-1])) if across else np.zeros(1)
+    # Turned faces are found as upright ones too, whatever they are.
+    gains = [turn - turn[0] for turn in turns] or np.zeros((1, 4))
+    surer = np.quantile(gains, (1 - TURN_SHARE, 0.5), axis=0)
+    told = (surer[0] > 0) & (surer[1] > SURER) & (len(turns) >= TURN_LOOKS)
+    quarters = int((told * surer[1]).argmax())
+    if quarters in (1, 3) or float(np.median(np.abs(tilt))) > MAX_TILT_DEG:
+        raise UserError(
+            f"{media.path}: the picture lies on its side, no upright face is in it; turn the video"
+        )
+    if quarters:
         raise UserError(f"{media.path}: the picture is upside down; turn the video")
 
 
 def _looked_through(
     media: MediaInfo, progress: Progress
-) -> tuple[F64, F64, Bool, Bool, list[Tracklet], list[bool], list[str]]:
-    """Times [T] s, how much each picture differs from the last [T], repeated [T], damaged [T]; every face; heads down.
+) -> tuple[F64, F64, Bool, Bool, list[Tracklet], list[F64], list[str]]:
+    """Times [T] s, how much each picture differs from the last [T], repeated [T], damaged [T]; every face.
 
-    Faces are in pixels of a picture of at most SEARCH_SIDE. Last, what the person should know of the pictures' form.
+    Faces are in pixels of a picture of at most SEARCH_SIDE. Then `sureness_of_turns` of some, and what the
+    person should know of the pictures' form.
     """
     landmarker = FaceLandmarker()
     reader, follower = read_frames(media.path, SEARCH_SIDE), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
     recent = deque[float](maxlen=min(max(3, round(CUT_WINDOW_S * media.fps)), MOST_WINDOW))
-    changes, rows, on_head, next_look = Changes(), [], list[bool](), 0.0
+    changes, rows, turns, next_look = Changes(), [], list[F64](), 0.0
     for index, (time, rgb) in enumerate(reader):
         whole, near = changes.next(rgb, follower.widest)
         rows.append((time, whole, near, reader.damaged))
@@ -214,7 +221,7 @@ def _looked_through(
         recent.append(near[0])
         if follower.widest is not None and time >= next_look:
             next_look = time + TURN_S
-            on_head.append(stands_on_head(landmarker, rgb, follower.widest))
+            turns.append(sureness_of_turns(landmarker, rgb, follower.widest))
         if progress is not None:
             progress(min(len(rows), expected), expected)
     times, *views, damaged = zip(*rows)
@@ -228,7 +235,7 @@ def _looked_through(
     at, differences = np.array(times), np.array([change for change, _ in of_cuts])
     again = repeated(at, *(np.array(column) for column in zip(*of_repeats)))
     notes = _form(media, reader, len(at))
-    return at, differences, again, np.array(damaged), follower.tracklets, on_head, notes
+    return at, differences, again, np.array(damaged), follower.tracklets, turns, notes
 
 
 def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:

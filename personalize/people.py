@@ -164,14 +164,14 @@ def around(rgb: U8, box: F32) -> tuple[U8, F32]:
     return rgb[top : int(y + side) + 1, left : int(x + side) + 1], np.array([left, top], np.float32)
 
 
-def stands_on_head(landmarker: FaceLandmarker, rgb: U8, box: F32) -> bool:
-    """Whether a face is rather one turned by 180 degrees: such are found too, as upright ones, but less surely."""
+def sureness_of_turns(landmarker: FaceLandmarker, rgb: U8, box: F32) -> F64:
+    """[4] how surely a face is found around a box: as it is, and turned by one, two and three quarters to the left.
+
+    One that lies on its side or head is found too, often as an upright one, but less surely.
+    """
     part, _ = around(rgb, box)
-    upright, turned = (
-        max((face.score for face in landmarker.detect(np.ascontiguousarray(picture))), default=0.0)
-        for picture in (part, part[::-1, ::-1])
-    )
-    return turned > upright
+    pictures = (np.ascontiguousarray(np.rot90(part, quarters)) for quarters in range(4))
+    return np.array([max((face.score for face in landmarker.detect(p)), default=0.0) for p in pictures])
 
 
 def _face_patch(rgb: U8, box: F32) -> U8:

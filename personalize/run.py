@@ -23,7 +23,7 @@ from tracker.refine import Refined
 from tracker.track import Bundle, Camera, Landmarks, Track
 
 SCHEMA = 1
-VIDEO_KEYS = {"name", "path", "sha256"}
+VIDEO_KEYS, STAGE_KEYS = {"name", "path", "sha256"}, {"key", "seconds", "outputs"}
 
 
 def tool_version() -> str:
@@ -36,7 +36,12 @@ def _is_run(state: Any) -> bool:
     if not isinstance(state, dict) or state.get("schema") != SCHEMA:
         return False
     parts = all(isinstance(state.get(key), dict) for key in ("video", "settings", "stages"))
-    return parts and state["video"].keys() >= VIDEO_KEYS
+    if not parts or not state["video"].keys() >= VIDEO_KEYS:
+        return False
+    entries = state["stages"].values()
+    return all(
+        isinstance(e, dict) and e.keys() >= STAGE_KEYS and isinstance(e["outputs"], dict) for e in entries
+    )
 
 
 class RunFolder:

@@ -14,7 +14,7 @@ import pytest
 from personalize.container import probe
 from personalize.errors import UserError
 from personalize.ingest import MIN_USABLE_S, _form, _without_sound, find_usable, ingest_video
-from personalize.people import FaceFollower, Sighting, Tracklet, main_person, stands_on_head
+from personalize.people import FaceFollower, Sighting, Tracklet, main_person, sureness_of_turns
 from personalize.shots import (
     REASONS,
     Changes,
@@ -272,32 +272,46 @@ def test_a_face_that_lies_on_its_side_is_refused(
         assert find_usable(probe(path))[0].usable.any()
 
 
-def test_a_head_that_is_found_more_surely_turned_round_stands_on_it() -> None:
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_a_face_is_found_most_surely_where_it_is_turned_upright(quarters: int) -> None:
     def detect(rgb: np.ndarray) -> list[Face]:
-        """A face whose hair is bright and above; less sure of one whose hair is below."""
+        """A face whose hair is bright and above; less sure of one whose hair is elsewhere."""
+        sides = [rgb[0, 30, 0], rgb[30, 0, 0], rgb[-1, 30, 0], rgb[30, -1, 0]]
         box, points = np.zeros(4, np.float32), np.zeros((6, 2), np.float32)
-        return [Face(box, points, 0.9 if rgb[0, 0, 0] > rgb[-1, 0, 0] else 0.6)]
+        return [Face(box, points, 0.9 if np.argmax(sides) == 0 else 0.6)]
 
     picture = np.zeros((60, 60, 3), np.uint8)
     picture[:20] = 200
     box = np.array([20, 20, 40, 40], np.float32)
-    assert not stands_on_head(Mock(detect=detect), picture, box)
-    assert stands_on_head(Mock(detect=detect), picture[::-1], box)
+    # np.rot90 turns to the left, as the looks do.
+    sure = sureness_of_turns(Mock(detect=detect), np.rot90(picture, -quarters), box)
+    assert sure.argmax() == quarters and np.sort(sure)[:3].tolist() == [0.6] * 3
 
 
-@pytest.mark.parametrize("refused", [True, False])
-def test_a_picture_that_is_upside_down_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: bool
+@pytest.mark.parametrize(
+    ("quarters", "surer", "refusal"),
+    [
+        (2, 0.3, "upside down; turn the video"),
+        (1, 0.06, "on its side"),
+        (3, 0.06, "on its side"),
+        (1, 0.04, None),  # a head that is tilted
+        (2, -0.3, None),
+    ],
+)
+def test_a_picture_that_is_turned_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quarters: int, surer: float, refusal: str | None
 ) -> None:
     path = write_video(tmp_path / "clip.mkv", moving(60), [i / 25 for i in range(60)])
     box = np.array([20, 20, 40, 40], np.float32)
     follow_one(monkeypatch, tracklet(1, range(60)), [60, 0], box)
+    told, errs = np.full(4, 0.6), np.array([0.6, 0.5, 0.5, 0.5])
+    told[quarters] += surer
     # One look of several errs.
-    looks = iter([not refused, *[refused] * 9])
+    looks = iter([errs if refusal else told, *[told] * 9])
     monkeypatch.setattr("personalize.ingest.TURN_S", 0.25)
-    monkeypatch.setattr("personalize.ingest.stands_on_head", lambda *_: next(looks))
-    if refused:
-        with pytest.raises(UserError, match="upside down; turn the video"):
+    monkeypatch.setattr("personalize.ingest.sureness_of_turns", lambda *_: next(looks))
+    if refusal:
+        with pytest.raises(UserError, match=refusal):
             find_usable(probe(path))
     else:
         assert find_usable(probe(path))[0].usable.any()
@@ -309,7 +323,8 @@ def test_a_head_on_its_side_is_told_so_whatever_the_detector_finds_surer(
     path = write_video(tmp_path / "clip.mkv", moving(60), [i / 25 for i in range(60)])
     box = np.array([20, 20, 40, 40], np.float32)
     follow_one(monkeypatch, tracklet(1, range(60)), [0, 60], box)
-    monkeypatch.setattr("personalize.ingest.stands_on_head", lambda *_: True)
+    monkeypatch.setattr("personalize.ingest.TURN_S", 0.25)
+    monkeypatch.setattr("personalize.ingest.sureness_of_turns", lambda *_: np.array([0.5, 0.5, 0.9, 0.5]))
     with pytest.raises(UserError, match="lies on its side"):
         find_usable(probe(path))
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -226,6 +226,28 @@ def test_another_videos_folder_is_refused(context: Context, tmp_path: Path) -> N
     assert (context.run.path / "run.json").read_bytes() == before
     with pytest.raises(UserError, match="not a run folder"):
         RunFolder.create(tmp_path, other)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda state: state.pop("stages"),
+        lambda state: state["video"].pop("sha256"),
+        lambda state: state["stages"].update(double="done"),
+        lambda state: state["stages"]["double"].pop("outputs"),
+        lambda state: state["stages"]["double"].update(outputs=[]),
+    ],
+)
+def test_a_run_json_that_somebody_has_edited_is_refused(
+    context: Context, damage: Callable[[dict[str, Any]], object]
+) -> None:
+    run_stages(STAGES, context)
+    path = context.run.path / "run.json"
+    state = json.loads(path.read_text())
+    damage(state)
+    path.write_text(json.dumps(state))
+    with pytest.raises(UserError, match="not a run of this version"):
+        RunFolder.open(context.run.path)
 
 
 def test_the_camera_believes_what_the_file_tells_of_the_lens(context: Context) -> None:
