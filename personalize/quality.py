@@ -14,12 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from personalize.files import write_text
 from personalize.shots import Frames
+from tracker.refine import Refined
 from tracker.track import F32, Track
 
 COLUMNS = (
     *("frame", "time_s", "valid", "confidence", "reprojection_px", "photometric", "lip_gap_mm"),
     *("yaw_deg", "pitch_deg", "roll_deg", "reason"),
 )
+# Of what is between the lips (see tracker.lip_opening): 2 to 16 % in films and clips that are well lit.
+LIKE_LIPS = 0.2
 FACING_CAMERA = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
@@ -53,6 +56,16 @@ def frame_reasons(frames: Frames, track: Track, doubts: Sequence[str], least: fl
     return [
         reason if reason != "ok" else "no_face" if not valid else "ok" if sure >= least else doubt
         for reason, valid, doubt, sure in zip(known, track.valid, doubts, track.confidence)
+    ]
+
+
+def lip_warnings(refined: Refined) -> list[str]:
+    """What the person should know of how well the openings are read."""
+    if not refined.like_lips > LIKE_LIPS:
+        return []
+    return [
+        f"what is between the lips hardly differs from them ({refined.like_lips:.0%} of it looks like lips): openings "
+        "may be measured a millimetre off; film in better light, sharper, or compressed less"
     ]
 
 

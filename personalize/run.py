@@ -194,12 +194,13 @@ def read_features(path: Path) -> FeatureTracks:
 def write_refined(folder: Path, refined: Refined) -> None:
     """`photometric/track.npz` and `photometric/deviation.npz`."""
     write_track(folder / "track.npz", refined.track)
-    write_npz(folder / "deviation.npz", deviation=refined.deviation)
+    write_npz(folder / "deviation.npz", deviation=refined.deviation, like_lips=np.array(refined.like_lips))
 
 
 def read_refined(folder: Path) -> Refined:
     """Inverse of `write_refined`."""
-    return Refined(read_track(folder / "track.npz"), read_npz(folder / "deviation.npz")["deviation"])
+    data = read_npz(folder / "deviation.npz")
+    return Refined(read_track(folder / "track.npz"), data["deviation"], float(data["like_lips"]))
 
 
 def write_camera(folder: Path, camera: Camera, bundle: Bundle) -> None:

@@ -19,7 +19,7 @@ from personalize.heads import head_assets, run_head
 from personalize.ingest import ingest_video
 from personalize.overlay import write_overlay
 from personalize.pictures import read_frames
-from personalize.quality import frame_reasons, write_quality
+from personalize.quality import frame_reasons, lip_warnings, write_quality
 from personalize.registration import register_run
 from personalize.run import RunFolder
 from personalize.settings import Settings
@@ -150,7 +150,7 @@ class TrackStage(Stage):
 class Refine(Stage):
     """The track again, with the grey levels of the skin."""
 
-    name, folder, version = "refine", "photometric", 23
+    name, folder, version = "refine", "photometric", 24
     needs = (
         *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),
@@ -173,12 +173,17 @@ class Refine(Stage):
             evidence=bare(files.read_appearance(root / "landmarks/appearance.npz")),
         )
         files.write_refined(folder, refined)
+        for text in lip_warnings(refined):
+            context.report.warn(text)
+
+    def warnings(self, run: RunFolder) -> Sequence[str]:
+        return lip_warnings(files.read_refined(run.path / self.folder))
 
 
 class ReadTracked(Stage):
     """Another tracker's result in the place of ours: camera, track and refine in one."""
 
-    name, folder, version = "refine", "photometric", 6
+    name, folder, version = "refine", "photometric", 7
     needs = ("ingest/frames.npz", "landmarks/landmarks.npz")
     makes = Refine.makes
 
@@ -268,10 +273,10 @@ class Finetune(Stage):
 class Evaluate(Stage):
     """Metrics on the test split, one clip beside its reference, the report."""
 
-    name, folder, version, reads = "evaluate", "evaluation", 2, ("seed", "overlay", "tracked")
+    name, folder, version, reads = "evaluate", "evaluation", 3, ("seed", "overlay", "tracked")
     needs = (
         *(VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv"),
-        *("overlay/preview.mp4", "overlay/contact_sheet.png", *JUDGED),
+        *("overlay/preview.mp4", "overlay/contact_sheet.png", "photometric/deviation.npz", *JUDGED),
     )
     makes, products = ("metrics.json", "samples/test.mp4", "samples/test.npz"), ("report.html",)
 

@@ -30,7 +30,7 @@ OPEN_MM = 2.5  # lips farther apart than this show what is inside
 # wider still, by about a tenth.
 LIP_MARGIN_MM, INSIDE_MARGIN_MM, INSIDE_SHARE = 0.5, 0.8, 0.2
 LEAST_INSIDE = 100  # samples; with fewer the clip hardly shows an open mouth
-MISTAKEN = 0.25  # share of what is inside that looks more like lips: above, the clip's colours tell nothing
+MOST_LIKE_LIPS = 0.5  # of what is inside: above, the clip's colours tell nothing
 DOUBT = 0.5  # log likelihood ratio up to which a colour tells nothing: a tongue is nearly that of lips
 TRUSTED = 3.0  # the most that one sample counts, as log likelihood ratio
 PRIOR_MM = 1.0  # standard deviation of width and middle about the marks'
@@ -41,27 +41,31 @@ DARKNESS = 0.33  # of the lip's light: what has less is dark
 LIT_REACH_MM = 1.2  # from the colours' edge
 
 
-def lip_edges(colours: U8, marks: F64, sound: Index) -> F64 | None:
+def lip_edges(colours: U8, marks: F64, sound: Index) -> tuple[F64 | None, float]:
     """[n, Q, 2] mm, the lips' inner edges, of colours [n, Q, S, 3] u8 along lines with the landmarks' marks [n, Q, 4].
 
     The landmarker sees a whole mouth too high or too low: what the edges found in the colours tell of that is taken out
     of the marks before they teach the colours again. sound: rows whose colours are the face's own. None where they do
-    not tell lips from what is between them.
+    not tell lips from what is between them. Beside them the share of the latter that looks more like lips; NaN where
+    the mouth hardly opens.
     """
     if not len(sound):
-        return None
+        return None, np.nan
     learned = sound[np.unique(np.linspace(0, len(sound) - 1, LEARNED).round().astype(int))]
     taught, down = colours[learned], 0.0
+    if (_classes(marks[learned]) == INSIDE).sum() < LEAST_INSIDE:
+        return None, np.nan
+    known = LipColours.of(taught, marks[learned])
     for _ in range(ROUNDS):
         moved = _moved(marks[learned], down)
-        if (known := LipColours.of(taught, moved)) is None:
-            return None
         down += _down(known.edges(taught, moved), moved)
+        known = LipColours.of(taught, _moved(marks[learned], down))
+    if known.like_lips > MOST_LIKE_LIPS:
+        return None, known.like_lips
     moved = _moved(marks, down)
-    if (known := LipColours.of(taught, moved[learned])) is None:
-        return None
     parts = np.array_split(np.arange(len(colours)), max(1, len(colours) // LEARNED))
-    return np.concatenate(list(side_by_side(lambda rows: known.edges(colours[rows], moved[rows]), parts)))
+    edges = side_by_side(lambda rows: known.edges(colours[rows], moved[rows]), parts)
+    return np.concatenate(list(edges)), known.like_lips
 
 
 @dataclass(frozen=True)
@@ -69,20 +73,26 @@ class LipColours:
     """How likely colours are upper lip, lower lip or what is between them, in one clip.
 
     table: [3, BINS^3] log likelihoods of the bins of colour, which begin at low [3] and are 1 / scale [3] wide.
+    like_lips: share of what is between them that looks more like lips.
     """
 
     low: F64
     scale: F64
     table: F32
+    like_lips: float
 
     @classmethod
-    def of(cls, colours: U8, marks: F64) -> LipColours | None:
-        """What colours [n, Q, S, 3] are if the marks [n, Q, 4] are about right; None if that tells nothing."""
+    def of(cls, colours: U8, marks: F64) -> LipColours:
+        """What colours [n, Q, S, 3] are if the marks [n, Q, 4] are about right."""
+        classes = _classes(marks)
         axes = _colour_axes(colours, marks)
         low, high = np.quantile(axes.reshape(-1, 3), (0.005, 0.995), axis=0)
         scale = BINS / np.maximum(high - low, LEAST_RANGE)
-        table = _likelihoods(_bins(axes, low, scale), _classes(marks))
-        return None if table is None else cls(low, scale, table)
+        bins = _bins(axes, low, scale)
+        table = _likelihoods(bins, classes)
+        inside = table[:, bins[classes == INSIDE]]
+        like_lips = (inside[INSIDE] <= np.maximum(inside[UPPER], inside[LOWER])).mean()
+        return cls(low, scale, np.clip(table - table.max(0) + DOUBT, -TRUSTED, 0), float(like_lips))
 
     def edges(self, colours: U8, marks: F64) -> F64:
         """[n, Q, 2] mm along the lines: where the upper lip ends and the lower one begins.
@@ -135,20 +145,14 @@ def _bins(axes: F32, low: F64, scale: F64) -> NDArray[np.int32]:
     return (bins[..., 0] * BINS + bins[..., 1]) * BINS + bins[..., 2]
 
 
-def _likelihoods(bins: NDArray[np.int32], classes: NDArray[np.int8]) -> F32 | None:
-    """[3, BINS^3] log likelihood of a colour in each class, against the likeliest; None if they are not distinct."""
-    inside = bins[classes == INSIDE]
-    if len(inside) < LEAST_INSIDE:
-        return None
+def _likelihoods(bins: NDArray[np.int32], classes: NDArray[np.int8]) -> F32:
+    """[3, BINS^3] log likelihood of a colour in each class, of samples in these bins and classes."""
     table = np.empty((3, BINS**3), np.float32)
     for name in (UPPER, INSIDE, LOWER):
         count = np.bincount(bins[classes == name], minlength=BINS**3).reshape(BINS, BINS, BINS)
         smooth = gaussian_filter(count.astype(np.float64), 1.0, mode="nearest").ravel()
         table[name] = np.log(smooth / max(smooth.sum(), 1e-9) + RARE / BINS**3)
-    mistaken = (table[INSIDE] <= np.maximum(table[UPPER], table[LOWER]))[inside].mean()
-    if mistaken > MISTAKEN:
-        return None
-    return np.clip(table - table.max(0) + DOUBT, -TRUSTED, 0)
+    return table
 
 
 @njit(cache=True, nogil=True)

@@ -38,14 +38,15 @@ Frame = tuple[float, U8]
 
 @dataclass(frozen=True)
 class Refined:
-    """A track, and how far its skin is from what it should look like.
+    """A track, and what speaks against it.
 
     deviation: [T, 2] mean deviation of the grey levels, of all skin and of the mouth's, 1 in the clip's median; NaN
-    where nothing was compared.
+    where nothing was compared. like_lips: see `lip_edges`; NaN where no colours were read.
     """
 
     track: Track
     deviation: F32
+    like_lips: float = np.nan
 
 
 def refine_track(
@@ -92,7 +93,7 @@ def refine_track(
     on_bundle = hold_poses(x, bundle, good, run, time, sound)
     if rigid := nearer_to_skin(subject, held, rows, x, on_bundle):
         x = on_bundle
-    widths = _read_widths(lines, colours, good, segment, landmarks.time, sound)
+    widths, like_lips = _read_widths(lines, colours, good, segment, landmarks.time, sound)
     opened = lines.opened(observed, lines.widths(_fitted(subject, observed, x)) if widths is None else widths)
     subject = _with_landmarks(subject, opened, x, sound)
     identity = fit_identity_to_skin(subject, held, keys, x)
@@ -125,26 +126,26 @@ def refine_track(
     if rigid:
         refined = hold_poses(refined, bundle, good, run, time, sound, HALFWAY)
     out = make_track(landmarks, camera, head, subject.energy, opened, identity, refined, good)
-    return Refined(out, _relative(deviation, good, len(track.time)))
+    return Refined(out, _relative(deviation, good, len(track.time)), like_lips)
 
 
 def _read_widths(
     lines: LipLines, colours: dict[int, U8], good: Index, segment: NDArray[np.int32], time: F64, sound: Index
-) -> F64 | None:
-    """[n, Q] mm between the lips, of the colours along the lines by rows; None where they do not tell it.
+) -> tuple[F64 | None, float]:
+    """[n, Q] mm between the lips, of the colours along the lines by rows; None where they do not tell it; `like_lips`.
 
     Rows without colours keep the landmarks' widths, and lips are not followed across them. good: [n], the rows' frames.
     segment: [T], number of the uninterrupted shot. time: [T] s. sound: rows that are believed.
     """
     rows, along = np.array(list(colours)), np.stack(list(colours.values()))
     bare = np.isin(rows, sound)
-    edges = lip_edges(along, lines.marks[rows], np.flatnonzero(bare))
+    edges, like_lips = lip_edges(along, lines.marks[rows], np.flatnonzero(bare))
     if edges is None:
-        return None
+        return None, like_lips
     widths = lines.marks[..., 2] - lines.marks[..., 1]
     run = np.where(bare, runs(good[rows], segment, time), -1)
     widths[rows] = steadied(edges, along, run, time[good[rows]])
-    return widths
+    return widths, like_lips
 
 
 def _fitted(subject: Subject, observed: F64, x: F64) -> F64:

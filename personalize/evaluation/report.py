@@ -15,8 +15,8 @@ from personalize.evaluation import charts
 from personalize.evaluation.evaluate import SYSTEMS, Evaluation
 from personalize.files import write_text
 from personalize.overlay import PREVIEW_S
-from personalize.quality import LeftOut, left_out, read_reasons
-from personalize.run import RunFolder, read_camera, read_track, tool_version
+from personalize.quality import LeftOut, left_out, lip_warnings, read_reasons
+from personalize.run import RunFolder, read_camera, read_refined, read_track, tool_version
 from personalize.settings import Settings
 from tracker.overlay import MODES
 
@@ -50,7 +50,7 @@ def write_report(run: RunFolder, evaluation: Evaluation, settings: Settings, fol
         video=run.video.name,
         version=tool_version(),
         when=time.strftime("%Y-%m-%d %H:%M"),
-        warnings=media["warnings"],
+        warnings=[*media["warnings"], *lip_warnings(read_refined(run.path / "photometric"))],
         cards=_cards(metrics["systems"], duration, float(used.mean())),
         overlay=_data_url(run.path / "overlay/preview.mp4", "video/mp4"),
         modes=[{"name": mode, "meaning": MODES[mode]} for mode in settings.overlay],

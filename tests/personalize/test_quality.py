@@ -9,10 +9,12 @@ import pytest
 
 from personalize.evaluation.report import _apart
 from personalize.pipeline import STAGES
-from personalize.quality import frame_reasons, left_out, read_reasons, write_quality
+from personalize.quality import frame_reasons, left_out, lip_warnings, read_reasons, write_quality
+from personalize.run import read_refined, write_refined
 from personalize.shots import REASONS, Frames
 from tests.personalize.test_registration import track_of
 from tracker.head import load_head
+from tracker.refine import Refined
 
 TIME = np.arange(6) / 25
 DOUBTS = ["occluded", "occluded", "blurred", "poor_fit", "poor_fit", "poor_fit"]
@@ -50,6 +52,17 @@ def test_quality_csv_carries_the_reasons(frames, track, tmp_path: Path):
 
 def test_another_threshold_judges_again_and_makes_nothing_else():
     assert [stage.name for stage in STAGES if "min_confidence" in stage.reads] == ["judge"]
+
+
+@pytest.mark.parametrize(
+    ("like_lips", "text"), [(np.nan, None), (0.16, None), (0.31, "31% of it looks like lips"), (0.7, "70%")]
+)
+def test_a_mouth_whose_inside_looks_like_lips_is_told_of(
+    track, tmp_path: Path, like_lips: float, text: str | None
+):
+    write_refined(tmp_path, Refined(track, np.ones((6, 2), np.float32), like_lips))
+    (told,) = lip_warnings(read_refined(tmp_path)) or [None]
+    assert (text in told) if text else told is None
 
 
 def test_spans_end_where_the_next_frame_begins():

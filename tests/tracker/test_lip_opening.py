@@ -45,7 +45,7 @@ def marked(width: np.ndarray) -> np.ndarray:
 
 def lip_widths(colours: np.ndarray, marks: np.ndarray, sound: np.ndarray) -> np.ndarray | None:
     """[n, 9] mm between the edges."""
-    edges = lip_edges(colours, marks, sound)
+    edges, _ = lip_edges(colours, marks, sound)
     return None if edges is None else np.maximum(edges[..., 1] - edges[..., 0], 0)
 
 
@@ -103,14 +103,28 @@ def test_light_changes_nothing(openings: tuple[np.ndarray, np.ndarray]):
 
 def test_nothing_is_told_without_a_difference(openings: tuple[np.ndarray, np.ndarray]):
     true, seen = openings
-    assert lip_widths(np.zeros_like(painted(true)), marked(seen), ALL) is None
-    assert lip_widths(painted(true, inside=(UPPER, LOWER)), marked(seen), ALL) is None
+    for colours in (np.zeros_like(painted(true)), painted(true, inside=(UPPER, LOWER))):
+        edges, like_lips = lip_edges(colours, marked(seen), ALL)
+        assert edges is None and like_lips > 0.8
 
 
 def test_a_mouth_that_never_opens_tells_nothing():
     shut = np.full((FRAMES, 9), 0.4)
-    assert lip_widths(painted(0 * shut), marked(shut), ALL) is None
-    assert lip_widths(painted(0 * shut)[:1], marked(shut)[:1], ALL[:1]) is None
+    for part in (ALL, ALL[:1]):
+        edges, like_lips = lip_edges(painted(0 * shut)[part], marked(shut)[part], ALL[: len(part)])
+        assert edges is None and np.isnan(like_lips)
+
+
+def test_colours_that_noise_makes_alike_still_tell_more_than_landmarks(
+    openings: tuple[np.ndarray, np.ndarray],
+):
+    true, seen = openings
+    clear = painted(true)
+    noise = np.random.default_rng(3).normal(size=clear.shape) * 60
+    edges, like_lips = lip_edges(np.clip(clear + noise, 0, 255).astype(np.uint8), marked(seen), ALL)
+    assert edges is not None and 0.2 < like_lips < 0.4
+    assert (edges[..., 1] - edges[..., 0] - true).std() < 0.7 * (seen - true).std()
+    assert lip_edges(clear, marked(seen), ALL)[1] < 0.02
 
 
 def test_what_covers_the_mouth_teaches_nothing(openings: tuple[np.ndarray, np.ndarray]):

@@ -168,12 +168,12 @@ def test_lips_are_not_followed_across_pictures_that_are_missing(film: Film, monk
     lines = LipLines.across(observed, energy.px_per_m, x)
     colours = {row: lines.read(film.pictures[row], row) for row in range(FRAMES) if row not in (8, 9, 10)}
     told: list[np.ndarray] = []
-    monkeypatch.setattr(refine, "lip_edges", lambda along, marks, sound: marks[..., 1:3])
+    monkeypatch.setattr(refine, "lip_edges", lambda along, marks, sound: (marks[..., 1:3], 0.1))
     monkeypatch.setattr(
         refine, "steadied", lambda edges, along, run, time: told.append(run) or np.ones((len(run), 9))
     )
     one_shot, time = np.zeros(FRAMES, np.int32), film.landmarks.time
-    widths = _read_widths(lines, colours, good, one_shot, time, np.arange(1, FRAMES))
+    widths, _ = _read_widths(lines, colours, good, one_shot, time, np.arange(1, FRAMES))
     assert widths is not None
     np.testing.assert_array_equal(told[0], [-1, *[0] * 7, *[1] * (FRAMES - 11)])
     np.testing.assert_allclose(widths[[8, 9, 10]], lines.widths(observed)[[8, 9, 10]])
