@@ -19,6 +19,16 @@ from personalize.recorded_lens import recorded_focal_mm
 MAX_DURATION_S = 4 * 3600.0
 MATROSKA = "matroska,webm"
 MAX_SIDE_PX = 16_384
+# FFmpeg's AVVideoEncParams: how many blocks from where, of what size, on which scale, and the steps that theirs, behind
+# place and size of each, are beyond.
+_CODED_BLOCKS = np.dtype(
+    {
+        "names": ["count", "at", "size", "kind", "steps"],
+        "formats": ["<u4", "<u8", "<u8", "<i4", "<i4"],
+        "offsets": [0, 8, 16, 24, 28],
+    }
+)
+_H264_QUANTIZER = 1
 STILL_FORMATS = ("_pipe", "image2", "gif")  # ends of the names of FFmpeg's readers of pictures
 
 
@@ -170,6 +180,20 @@ def display_matrix(frame: Any) -> NDArray[np.int64]:
             if abs(round(float(np.linalg.det(matrix)))) == 1 and np.abs(matrix).sum() == 2:
                 return matrix
     return np.eye(2, dtype=np.int64)
+
+
+def quantizer(frame: Any) -> float | None:
+    """How coarsely a picture is coded, 0 to 51; None unless it is H.264 and its decoder was told to export it."""
+    for side in frame.side_data:
+        if side.type == SideData.VIDEO_ENC_PARAMS:
+            data = memoryview(side)
+            blocks = np.frombuffer(data, _CODED_BLOCKS, count=1)[0]
+            if blocks["kind"] != _H264_QUANTIZER or not blocks["count"]:
+                return None
+            each = np.frombuffer(data, np.uint8, blocks["count"] * blocks["size"], blocks["at"])
+            beyond = each.reshape(blocks["count"], -1)[:, 16:20].copy().view("<i4")
+            return float(blocks["steps"] + beyond.mean()) - 6 * (frame.format.components[0].bits - 8)
+    return None
 
 
 def probe(path: Path | str) -> MediaInfo:

@@ -58,6 +58,7 @@ TURN_SHARE, SURER = 0.75, 0.05
 SILENCE = 1e-3  # peak of the sound, -60 dB
 MOST_SILENT_S = 1.0  # of pictures before the sound begins or after it ends
 MOST_INTERLACED = 0.5  # share of the pictures
+MOST_QUANTIZER = 32.0  # of H.264's 51: telephones and webcams have 16 to 27
 MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it for no longer
 
 DESCRIPTIONS = {
@@ -209,7 +210,7 @@ def _looked_through(
     person should know of the pictures' form.
     """
     landmarker = FaceLandmarker()
-    reader, follower = read_frames(media.path, SEARCH_SIDE), FaceFollower(landmarker)
+    reader, follower = read_frames(media.path, SEARCH_SIDE, quantizers=True), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
     recent = deque[float](maxlen=min(max(3, round(CUT_WINDOW_S * media.fps)), MOST_WINDOW))
     changes, rows, turns, next_look = Changes(), [], list[F64](), 0.0
@@ -239,7 +240,7 @@ def _looked_through(
 
 
 def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:
-    """Pictures whose size changes, or that are woven of two fields."""
+    """Pictures whose size changes, that are woven of two fields, or coded coarsely."""
     texts = []
     if not np.isnan(reader.resized_s):
         texts.append(
@@ -249,6 +250,11 @@ def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:
     if reader.interlaced > MOST_INTERLACED * total:
         texts.append(
             "the film is interlaced: lips may be measured a third less well; set the camera to progressive pictures"
+        )
+    if reader.quantizers and (steps := np.median(reader.quantizers)) > MOST_QUANTIZER:
+        texts.append(
+            f"the film is compressed hard (quantizer {steps:.0f} of 51): lips and how the head turns may be measured "
+            "half as well; give the original, or film in a higher quality"
         )
     return texts
 

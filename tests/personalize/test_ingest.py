@@ -53,12 +53,20 @@ def follow_one(
 
 
 @pytest.mark.parametrize(
-    ("resized_s", "interlaced", "said"),
-    [(np.nan, 10, []), (np.nan, 20, ["interlaced"]), (1.0, 20, ["changes at 1.0 s", "interlaced"])],
+    ("resized_s", "interlaced", "quantizers", "said"),
+    [
+        (np.nan, 10, [], []),
+        (np.nan, 20, [27.0], ["interlaced"]),
+        (1.0, 20, [], ["changes at 1.0 s", "interlaced"]),
+        (np.nan, 0, [20.0, 36.2, 36.4], ["compressed hard (quantizer 36 of 51)"]),
+    ],
 )
-def test_pictures_of_an_unusual_form_are_told(resized_s: float, interlaced: int, said: list[str]) -> None:
+def test_pictures_of_an_unusual_form_are_told(
+    resized_s: float, interlaced: int, quantizers: list[float], said: list[str]
+) -> None:
     media = SimpleNamespace(width=96, height=64)
-    texts = _form(media, SimpleNamespace(resized_s=resized_s, interlaced=interlaced), 25)
+    reader = SimpleNamespace(resized_s=resized_s, interlaced=interlaced, quantizers=quantizers)
+    texts = _form(media, reader, 25)
     assert len(texts) == len(said) and all(words in text for words, text in zip(said, texts))
 
 

@@ -195,6 +195,28 @@ def test_interlaced_pictures_are_counted(tmp_path: Path, flags: str, woven: int)
     assert len(list(reader)) == 25 and reader.interlaced == woven and np.isnan(reader.resized_s)
 
 
+@pytest.mark.parametrize(
+    ("pixels", "told", "steps"),
+    # Of ten bits x264 counts from -12: the file comes out as large as that of eight at 40.
+    [("yuv420p", 20, 20), ("yuv420p", 40, 40), ("yuv420p10le", 52, 40)],
+)
+def test_how_coarsely_pictures_are_coded_is_known(tmp_path: Path, pixels: str, told: int, steps: int) -> None:
+    rng = np.random.default_rng(0)  # noise, so that no block is left out
+    pictures = [rng.integers(0, 255, (64, 96, 3), np.uint8) for _ in range(25)]
+    constant = {"x264-params": f"qp={told}:ipratio=1:bframes=0:aq-mode=0"}
+    path = write_video(tmp_path / "v.mp4", pictures, STEADY, pixels=pixels, options=constant)
+    reader = read_frames(path, quantizers=True)
+    assert len(list(reader)) == len(reader.quantizers) == 25
+    np.testing.assert_allclose(reader.quantizers, steps, atol=0.5)
+
+
+def test_other_codecs_do_not_tell_how_coarsely_pictures_are_coded(tmp_path: Path) -> None:
+    for codec, quantizers in (("mpeg4", True), ("libx264", False)):
+        path = write_video(tmp_path / f"{codec}.mp4", moving(5), STEADY[:5], codec=codec)
+        reader = read_frames(path, quantizers=quantizers)
+        assert len(list(reader)) == 5 and reader.quantizers == []
+
+
 @pytest.mark.parametrize("colours", [8, 14])
 def test_colours_that_cannot_be_read_are_named(tmp_path: Path, colours: int) -> None:
     path = write_video(tmp_path / "v.mp4", moving(3), STEADY[:3], colours=colours)
