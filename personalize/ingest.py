@@ -58,7 +58,9 @@ TURN_SHARE, SURER = 0.75, 0.05
 SILENCE = 1e-3  # peak of the sound, -60 dB
 MOST_SILENT_S = 1.0  # of pictures before the sound begins or after it ends
 MOST_INTERLACED = 0.5  # share of the pictures
-MOST_QUANTIZER = 32.0  # of H.264's 51: telephones and webcams have 16 to 27
+# Of the picture's details, for each px between the eyes; they double with every sixth step of H.264's quantizer, of
+# which telephones and webcams have 16 to 27.
+COARSE = 0.3
 MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it for no longer
 
 DESCRIPTIONS = {
@@ -136,11 +138,12 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
 
     In one pass: a cut is told by the pictures behind it too, so what was followed across one is divided afterwards.
     """
-    time, change, again, corrupt, faces, turns, notes = _looked_through(media, progress)
+    looked = _looked_through(media, progress)
+    time, again = looked.time, looked.again
     _check_rate(media, time[~again])
-    segment = find_shots(time, change)
-    mine, others = main_person([shot for face in faces for shot in face.shots(segment)])
-    _check_upright(media, mine, turns)
+    segment = find_shots(time, looked.change)
+    mine, others = main_person([shot for face in looked.faces for shot in face.shots(segment)])
+    _check_upright(media, mine, looked.turns)
     total = len(time)
     reason = np.full(total, REASONS.index("no_face"), np.uint8)
     for tracklet in others:
@@ -161,12 +164,13 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
         "too_small": seen & (eyes < MIN_EYES_PX),
         "cut": seen & _cut(time, segment),
         "duplicate": again & seen,
-        "corrupt": corrupt,
+        "corrupt": looked.corrupt,
     }
     for name, marked in marks.items():  # the last that applies stays
         reason[marked] = REASONS.index(name)
     frames = Frames(time, reason == 0, reason, REASONS, segment, box.astype(np.float32))
-    return frames, notes + _lost_in_file(media, time) + _warnings(frames, eyes, light, burnt)
+    notes = _form(media, looked.reader, total) + _lost_in_file(media, time)
+    return frames, notes + _warnings(frames, eyes, light, burnt, looked.reader.quantizers)
 
 
 def _check_rate(media: MediaInfo, changed: F64) -> None:
@@ -201,14 +205,24 @@ def _check_upright(media: MediaInfo, person: list[Tracklet], turns: list[F64]) -
         raise UserError(f"{media.path}: the picture is upside down; turn the video")
 
 
-def _looked_through(
-    media: MediaInfo, progress: Progress
-) -> tuple[F64, F64, Bool, Bool, list[Tracklet], list[F64], list[str]]:
-    """Times [T] s, how much each picture differs from the last [T], repeated [T], damaged [T]; every face.
+@dataclass(frozen=True)
+class _Seen:
+    """What one pass over the pictures shows.
 
-    Faces are in pixels of a picture of at most SEARCH_SIDE. Then `sureness_of_turns` of some, and what the
-    person should know of the pictures' form.
+    time: [T] s. change: [T], how much each differs from the last. again: [T] repeated. corrupt: [T] damaged. faces:
+    all, in px of pictures of at most SEARCH_SIDE. turns: `sureness_of_turns` of some. reader: at its end.
     """
+
+    time: F64
+    change: F64
+    again: Bool
+    corrupt: Bool
+    faces: list[Tracklet]
+    turns: list[F64]
+    reader: FrameReader
+
+
+def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
     landmarker = FaceLandmarker()
     reader, follower = read_frames(media.path, SEARCH_SIDE, quantizers=True), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
@@ -235,12 +249,11 @@ def _looked_through(
     of_cuts, of_repeats = views[usual < SMALL_FACE], views[usual < NEARLY_SMALL * SMALL_FACE]
     at, differences = np.array(times), np.array([change for change, _ in of_cuts])
     again = repeated(at, *(np.array(column) for column in zip(*of_repeats)))
-    notes = _form(media, reader, len(at))
-    return at, differences, again, np.array(damaged), follower.tracklets, turns, notes
+    return _Seen(at, differences, again, np.array(damaged), follower.tracklets, turns, reader)
 
 
 def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:
-    """Pictures whose size changes, that are woven of two fields, or coded coarsely."""
+    """Pictures whose size changes, or that are woven of two fields."""
     texts = []
     if not np.isnan(reader.resized_s):
         texts.append(
@@ -250,11 +263,6 @@ def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:
     if reader.interlaced > MOST_INTERLACED * total:
         texts.append(
             "the film is interlaced: lips may be measured a third less well; set the camera to progressive pictures"
-        )
-    if reader.quantizers and (steps := np.median(reader.quantizers)) > MOST_QUANTIZER:
-        texts.append(
-            f"the film is compressed hard (quantizer {steps:.0f} of 51): lips and how the head turns may be measured "
-            "half as well; give the original, or film in a higher quality"
         )
     return texts
 
@@ -293,7 +301,7 @@ def _lost_in_file(media: MediaInfo, time: F64) -> list[str]:
     return texts
 
 
-def _warnings(frames: Frames, eyes: F32, light: F32, burnt: F32) -> list[str]:
+def _warnings(frames: Frames, eyes: F32, light: F32, burnt: F32, quantizers: list[float]) -> list[str]:
     """What the person should know of a clip that is used all the same."""
     texts = []
     total = len(frames.time)
@@ -306,6 +314,12 @@ def _warnings(frames: Frames, eyes: F32, light: F32, burnt: F32) -> list[str]:
         if size < GOOD_EYES_PX:
             texts.append(
                 f"the face is small ({size:.0f} px between the eyes): lips will be measured coarsely"
+            )
+        if quantizers and 2 ** (np.median(quantizers) / 6) > COARSE * size:
+            texts.append(
+                f"the film is compressed hard (quantizer {np.median(quantizers):.0f} of 51, {size:.0f} px between the "
+                "eyes): lips and how the head turns may be measured half as well; give the original, or film in a "
+                "higher quality"
             )
         if level < GOOD_LIGHT:
             texts.append(
