@@ -327,8 +327,8 @@ def _warnings(frames: Frames, eyes: F32, light: F32, burnt: F32, quantizers: lis
             )
         if lost > GOOD_BURNT:
             texts.append(
-                f"the face is overexposed ({lost:.0%} of its colours cut off): lips may be measured a millimetre off; "
-                "film with less light or exposure"
+                f"the face is overexposed ({lost:.0%} of its colours cut off): lips may be measured half a millimetre "
+                "off; film with less light or exposure"
             )
     return texts
 
