@@ -18,6 +18,7 @@ from scipy.stats import rankdata
 from torch import from_numpy
 
 from benchmarks.ground_truth import GroundTruth
+from personalize.settings import Settings
 from tracker.head import HeadModel
 from tracker.raster import project, vertex_normals
 from tracker.track import F64, Track
@@ -38,11 +39,13 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
     """Errors by name: mm, degrees, frames, shares, or r for correlations; NaN where the clip cannot tell.
 
     Frames in which something covers the lips count for confidence and recovery alone; bare ones that have no
-    fit for recovery and as lost_pct, their share in %.
+    fit for recovery and as lost_pct, their share in %. left_out_pct, kept_pct: of the bare ones that have a fit and of
+    the covered ones, the share that is left out and used by default, %.
     """
     fitted = axis_angle_to_rotation_matrix(from_numpy(track.rotation.astype(np.float64))).numpy()
     bare = truth.covered <= COVERED
     judged = track.valid & bare
+    used = track.valid & (track.confidence >= Settings().min_confidence)
     resting = np.zeros(len(head.expression_names), np.float32)
     neutral = head.vertices(track.identity, resting).astype(np.float64)
     mean = head.template.astype(np.float64)
@@ -58,6 +61,8 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
         "turn_deg": turn(truth.rotation),
         "confidence_auc": separation(track.confidence, ~bare),
         "lost_pct": 100 * float(1 - track.valid[bare].mean()),
+        "left_out_pct": 100 * float(1 - used[judged].mean()),
+        "kept_pct": 100 * float(used[~bare].mean()) if not bare.all() else np.nan,
     }
 
 

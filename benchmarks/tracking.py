@@ -22,6 +22,7 @@ close, false    share of the lips' closures reached within one frame; of the fit
 auc             how often a covered frame has less confidence than a clear one
 back            frames until the fit recovers from a hand or a fast turn
 lost            share of the frames with bare lips that have no fit, and so count in no error but `back`, %
+out, kept       share of those that have a fit which is left out by default; of the covered frames that are used, %
 ms, cpu         time a frame of all stages up to here, from the search for usable frames on: on the clock,
                 and of all processors
 """
@@ -82,11 +83,24 @@ COLUMNS = {
     "auc": "confidence_auc",
     "back": "recovery_frames",
     "lost": "lost_pct",
+    "out": "left_out_pct",
+    "kept": "kept_pct",
     "ms": "ms",
     "cpu": "cpu",
 }
 TIMES = ("ms", "cpu")
-DECIMALS = {"r": 3, "jitter": 3, "still": 3, "focal": 1, "back": 0, "lost": 1, "ms": 0, "cpu": 0}
+DECIMALS = {
+    "r": 3,
+    "jitter": 3,
+    "still": 3,
+    "focal": 1,
+    "back": 0,
+    "lost": 1,
+    "out": 1,
+    "kept": 1,
+    "ms": 0,
+    "cpu": 0,
+}
 EMPTY = np.zeros((0, 3), np.float32)
 NO_BUNDLE = Bundle(np.zeros(0, np.int32), EMPTY, EMPTY, EMPTY, np.zeros((0, 4), np.float32))
 

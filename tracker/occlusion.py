@@ -24,10 +24,14 @@ SMOOTHING_PX = 2.0  # of the crop: colours of patches, not of pores and noise
 DARK = 8.0  # grey levels added before the logarithm: below, contrast is noise
 CONTRAST = 0.02  # of log colour: a region whose pattern is weaker than this cannot be told from another
 LEARNED = 400  # frames, spread over the clip, that the patterns are learned from
-PATTERNS = 3  # components besides the mean: a turned head, other light, an open mouth
+PATTERNS = 4  # components besides the mean: a turned head, other light, an open mouth
 FRAMES_PER_PATTERN = 20  # fewer would make each frame its own pattern
-TRUSTED = 0.6  # share of the frames that are taken to show the bare face
+# Share of the frames that are taken to show the bare face; then those too that look no stranger than this to them, so
+# that what changes little by little, a turn or the light, is followed, and what comes from outside is not.
+TRUSTED, ALIKE = 0.6, 0.08
+TRUSTING, FOLLOWING = 4, 3  # rounds of either
 LEAST_POINTS = 20  # of a region: in a clip of profiles the far side has fewer
+MIDDLE = 0.05  # of the distance between the eyes, to either side
 EYE_REACH = 0.27  # of the distance between the eyes: lids and gaze change within it and cover nothing
 
 
@@ -95,9 +99,10 @@ def _detail(face: U8) -> float:
 
 
 def regions(place: NDArray[np.floating]) -> list[NDArray[np.intp]]:
-    """Landmarks of the mouth with the chin, and of each side of the upper face, without the eyes and the rim.
+    """Landmarks of each side of the mouth with the chin, and of the upper face, without the eyes and the rim.
 
-    place: [478, 2], a typical face, upright, in any unit.
+    The mouth's sides share its middle. With half of it covered the mouth as a whole looks much alike. place: [478, 2],
+    a typical face, upright, in any unit.
     """
     eyes = float(np.linalg.norm(place[RIGHT_EYE_OUTER] - place[LEFT_EYE_OUTER]))
     to_iris = [np.linalg.norm(place - place[iris], axis=1) for iris in IRIS_CENTRES]
@@ -105,7 +110,8 @@ def regions(place: NDArray[np.floating]) -> list[NDArray[np.intp]]:
     skin[list(OVAL)] = False
     x, y = ((place - place[list(LIPS)].mean(0)) / eyes).T
     mouth = (np.abs(x) < 0.5) & (y > -0.25) & (y < 0.4)
-    parts = [np.flatnonzero(skin & part) for part in (mouth, ~mouth & (x < -0.05), ~mouth & (x > 0.05))]
+    sides = (mouth & (x < MIDDLE), mouth & (x > -MIDDLE), ~mouth & (x < -MIDDLE), ~mouth & (x > MIDDLE))
+    parts = [np.flatnonzero(skin & part) for part in sides]
     return [part for part in parts if len(part) >= LEAST_POINTS]
 
 
@@ -114,9 +120,12 @@ def _strangeness(colour: U8) -> F64:
     learned = np.unique(np.linspace(0, len(colour) - 1, LEARNED).round().astype(int))
     values = _contrasts(colour[learned])
     patterns, mean = np.zeros((0, values.shape[1])), np.median(values, axis=0)
-    for _ in range(4):
+    for turn in range(TRUSTING + FOLLOWING):
         strange = _unlike(values, mean, patterns)
-        taken = np.argsort(strange, kind="stable")[: max(1, round(TRUSTED * len(learned)))]
+        count = max(1, round(TRUSTED * len(learned)))
+        if turn >= TRUSTING:
+            count = max(count, int((strange <= ALIKE).sum()))
+        taken = np.argsort(strange, kind="stable")[:count]
         mean = values[taken].mean(0)
         patterns = np.linalg.svd(values[taken] - mean, full_matrices=False)[2]
         patterns = patterns[: min(PATTERNS, len(taken) // FRAMES_PER_PATTERN)]

@@ -252,6 +252,20 @@ def test_bare_frames_without_a_fit_are_lost(exact: tuple[Track, GroundTruth], he
     assert errors["lost_pct"] == pytest.approx(100 * 2 / 11)
 
 
+def test_fitted_frames_are_left_out_or_used_by_their_confidence(
+    exact: tuple[Track, GroundTruth], head: HeadModel
+) -> None:
+    track, truth = exact
+    assert np.isnan(compare(track, head, truth)["kept_pct"])
+    covered = np.zeros(FRAMES)
+    covered[[5, 6, 7]] = 1.0
+    confidence = np.ones(FRAMES, np.float32)
+    confidence[[2, 5, 6]] = 0.4, 0.1, 0.49
+    errors = compare(replace(track, confidence=confidence), head, replace(truth, covered=covered))
+    assert errors["left_out_pct"] == pytest.approx(100 / (FRAMES - 3))
+    assert errors["kept_pct"] == pytest.approx(100 / 3)
+
+
 def test_a_turn_there_and_back_is_one_disturbance(exact: tuple[Track, GroundTruth]) -> None:
     _, truth = exact
     angle = np.array([0, 0, 0, 8, 20, 30, 31, 30, 20, 8, 0, 0])[:, None]

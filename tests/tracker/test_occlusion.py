@@ -46,8 +46,13 @@ def placement(frame: int) -> np.ndarray:
     return turn
 
 
-def clip(covered=None, spoil=None) -> tuple[list, Landmarks]:
-    """Frames and their landmarks. covered: [T] share 0..1 of the mouth's box that a flat thing has reached."""
+def clip(covered=None, spoil=None, wide=1.0, cover=None) -> tuple[list, Landmarks]:
+    """Frames and their landmarks.
+
+    covered: [T] share 0..1 of the mouth's box that a `cover` [SIDE, SIDE, 3], a thing with a texture of its own if none
+    is given, has reached from below. wide: share of its width.
+    """
+    cover = texture(7) if cover is None else cover
     frames, points = [], np.zeros((FRAMES, POINTS, 3), np.float32)
     own = texture(0)
     for frame in range(FRAMES):
@@ -55,7 +60,8 @@ def clip(covered=None, spoil=None) -> tuple[list, Landmarks]:
         if covered is not None and covered[frame] > 0:
             (left, low), (right, high) = MOUTH_PX
             rows = slice(round(high - covered[frame] * (high - low)), high)
-            picture[rows, left:right] = texture(7)[rows, left:right]
+            columns = slice(left, round(left + wide * (right - left)))
+            picture[rows, columns] = cover[rows, columns]
         gain = 1 + 0.25 * np.sin(0.3 * frame)  # the camera adjusts its exposure
         matrix = placement(frame)
         picture = cv2.warpAffine(picture, matrix, (SIDE, SIDE), borderMode=cv2.BORDER_REFLECT)
@@ -87,6 +93,25 @@ def test_a_mouth_that_is_covered_looks_strange_whether_it_came_at_once_or_slowly
     seen = look(*clip(covered))
     assert seen.strangeness[covered > 0.6].min() > 0.3
     assert seen.strangeness[covered == 0].max() < 0.08
+
+
+def test_a_mouth_that_is_covered_on_one_side_looks_strange():
+    covered = np.clip((np.arange(FRAMES) - 25) / 3, 0, 1)
+    covered[45:] = 0
+    seen = look(*clip(covered, wide=0.4, cover=np.full((SIDE, SIDE, 3), 130, np.uint8)))
+    assert seen.strangeness[covered > 0.6].min() > 0.22
+    assert seen.strangeness[covered == 0].max() < 0.08
+
+
+def test_light_that_comes_from_elsewhere_little_by_little_is_no_cover():
+    across = np.linspace(-1, 1, SIDE)[None, :, None]
+
+    def swept(frame, picture):
+        """The light wanders from the left to the right, and stays on the left most of the time."""
+        side = np.clip((frame - 30) / 20, 0, 1) * 2 - 1
+        return np.clip(picture * (1 - 0.75 * side * across), 0, 255).astype(np.uint8)
+
+    assert look(*clip(spoil=swept)).strangeness.max() < 0.1
 
 
 def test_a_blurred_frame_is_less_sharp_than_the_clip():
@@ -131,9 +156,11 @@ def test_an_all_black_clip_is_finite():
 
 
 def test_the_regions_are_apart_and_leave_out_eyes_and_rim():
-    parts = regions(POINTS_PX)
-    together = np.concatenate(parts)
-    assert len(np.unique(together)) == len(together)
-    assert set(LIPS) <= set(parts[0].tolist())
-    assert not {159, 145, 386, 374, 10, 152, 234, 454} & set(together.tolist())
-    assert min(map(len, parts)) > 40
+    right, left, *upper = (set(part.tolist()) for part in regions(POINTS_PX))
+    mouth = right | left
+    together = set.union(mouth, *upper)
+    assert len(together) == len(mouth) + sum(map(len, upper))
+    assert set(LIPS) <= mouth and {61, 78} <= right - left and {291, 308} <= left - right
+    assert {0, 13, 14, 17} <= right & left and len(right & left) < 0.25 * len(mouth)
+    assert not {159, 145, 386, 374, 10, 152, 234, 454} & together
+    assert min(map(len, (right, left, *upper))) > 40
