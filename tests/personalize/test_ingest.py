@@ -354,7 +354,8 @@ def test_sound_that_does_not_last_as_long_as_the_pictures_is_told() -> None:
         (120.0, 0.1, "ok", ""),
         (190.0, 0.35, "ok", "overexposed (35% of its colours cut off)"),
         (230.0, 0.7, "too_bright", "left out: the face is overexposed"),
-        (25.0, 0.0, "ok", "dark (25 of 255)"),
+        (65.0, 0.0, "ok", ""),
+        (45.0, 0.0, "ok", "dark (45 of 255)"),
         (8.0, 0.0, "too_dark", "left out: the face is too dark"),
     ],
 )
