@@ -89,18 +89,11 @@ COLUMNS = {
     "cpu": "cpu",
 }
 TIMES = ("ms", "cpu")
-DECIMALS = {
-    "r": 3,
-    "jitter": 3,
-    "still": 3,
-    "focal": 1,
-    "back": 0,
-    "lost": 1,
-    "out": 1,
-    "kept": 1,
-    "ms": 0,
-    "cpu": 0,
-}
+DECIMALS = (
+    dict.fromkeys(("r", "jitter", "still"), 3)
+    | dict.fromkeys(("focal", "lost", "out", "kept"), 1)
+    | dict.fromkeys(("back", "ms", "cpu"), 0)
+)
 EMPTY = np.zeros((0, 3), np.float32)
 NO_BUNDLE = Bundle(np.zeros(0, np.int32), EMPTY, EMPTY, EMPTY, np.zeros((0, 4), np.float32))
 

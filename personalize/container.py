@@ -5,6 +5,7 @@ from __future__ import annotations
 import stat
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,6 +30,7 @@ _CODED_BLOCKS = np.dtype(
     }
 )
 _H264_QUANTIZER = 1
+QUANTIZER_FRAMES = 40  # that tell of it
 STILL_FORMATS = ("_pipe", "image2", "gif")  # ends of the names of FFmpeg's readers of pictures
 
 
@@ -182,14 +184,25 @@ def display_matrix(frame: Any) -> NDArray[np.int64]:
     return np.eye(2, dtype=np.int64)
 
 
-def quantizer(frame: Any) -> float | None:
-    """How coarsely a picture is coded, 0 to 51; None unless it is H.264 and its decoder was told to export it."""
+def quantizer(path: Path) -> float:
+    """How coarsely a film begins to be coded, 0 to 51, in the median picture; NaN unless it is H.264."""
+    with Source(path) as source:
+        # By one thread: with several, a picture is handed out while the steps of its blocks are still filled in.
+        source.video.thread_type, source.video.codec_context.thread_count = "NONE", 1
+        source.video.codec_context.options = {"export_side_data": "venc_params"}
+        steps = [_quantizer(frame) for frame in islice(source.decode(source.video), QUANTIZER_FRAMES)]
+    known = [value for value in steps if value is not None]
+    return float(np.median(known)) if known else np.nan
+
+
+def _quantizer(frame: Any) -> float | None:
+    """Of one picture, the mean of its blocks."""
     for side in frame.side_data:
         if side.type == SideData.VIDEO_ENC_PARAMS:
             data = memoryview(side)
             blocks = np.frombuffer(data, _CODED_BLOCKS, count=1)[0]
             if blocks["kind"] != _H264_QUANTIZER or not blocks["count"]:
-                return None
+                break
             each = np.frombuffer(data, np.uint8, blocks["count"] * blocks["size"], blocks["at"])
             beyond = each.reshape(blocks["count"], -1)[:, 16:20].copy().view("<i4")
             return float(blocks["steps"] + beyond.mean()) - 6 * (frame.format.components[0].bits - 8)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from personalize.container import MediaInfo, probe
+from personalize.container import MediaInfo, probe, quantizer
 from personalize.errors import UserError
 from personalize.people import FaceFollower, Tracklet, main_person, sureness_of_turns
 from personalize.pictures import FrameReader, read_frames
@@ -171,7 +171,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
         reason[marked] = REASONS.index(name)
     frames = Frames(time, reason == 0, reason, REASONS, segment, box.astype(np.float32))
     notes = _form(media, looked.reader, total) + _lost_in_file(media, time)
-    return frames, notes + _warnings(frames, eyes, light, burnt, looked.reader.quantizers)
+    return frames, notes + _warnings(frames, eyes, light, burnt, quantizer(Path(media.path)))
 
 
 def _check_rate(media: MediaInfo, changed: F64) -> None:
@@ -194,10 +194,12 @@ def _check_upright(media: MediaInfo, person: list[Tracklet], turns: list[F64]) -
     across = [shape[LEFT_EYE_OUTER, :2] - shape[RIGHT_EYE_OUTER, :2] for t in person for shape in t.shapes]
     tilt = np.degrees(np.arctan2(*np.transpose(across)[::-1])) if across else np.zeros(1)
     # Turned faces are found as upright ones too, whatever they are.
-    gains = [turn - turn[0] for turn in turns] or np.zeros((1, 4))
-    surer = np.quantile(gains, (1 - TURN_SHARE, 0.5), axis=0)
-    told = (surer[0] > 0) & (surer[1] > SURER) & (len(turns) >= TURN_LOOKS)
-    quarters = int((told * surer[1]).argmax())
+    gains = np.array([turn - turn[0] for turn in turns if turn[0] > 0]).reshape(-1, 4)
+    quarters = 0
+    if len(gains) >= TURN_LOOKS:
+        surer = np.median(gains, axis=0)
+        told = (np.quantile(gains, 1 - TURN_SHARE, axis=0) > 0) & (surer > SURER)
+        quarters = int((told * surer).argmax())
     if quarters in (1, 3) or float(np.median(np.abs(tilt))) > MAX_TILT_DEG:
         raise UserError(
             f"{media.path}: the picture lies on its side, no upright face is in it; turn the video"
@@ -225,7 +227,7 @@ class _Seen:
 
 def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
     landmarker = FaceLandmarker()
-    reader, follower = read_frames(media.path, SEARCH_SIDE, quantizers=True), FaceFollower(landmarker)
+    reader, follower = read_frames(media.path, SEARCH_SIDE), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
     recent = deque[float](maxlen=min(max(3, round(CUT_WINDOW_S * media.fps)), MOST_WINDOW))
     changes, rows, turns, next_look = Changes(), [], list[F64](), 0.0
@@ -302,8 +304,8 @@ def _lost_in_file(media: MediaInfo, time: F64) -> list[str]:
     return texts
 
 
-def _warnings(frames: Frames, eyes: F32, light: F32, burnt: F32, quantizers: list[float]) -> list[str]:
-    """What the person should know of a clip that is used all the same."""
+def _warnings(frames: Frames, eyes: F32, light: F32, burnt: F32, steps: float) -> list[str]:
+    """What the person should know of a clip that is used all the same. steps: see `quantizer`."""
     texts = []
     total = len(frames.time)
     for number, name in enumerate(REASONS[1:], 1):
@@ -316,11 +318,10 @@ def _warnings(frames: Frames, eyes: F32, light: F32, burnt: F32, quantizers: lis
             texts.append(
                 f"the face is small ({size:.0f} px between the eyes): lips will be measured coarsely"
             )
-        if quantizers and 2 ** (np.median(quantizers) / 6) > COARSE * size:
+        if 2 ** (steps / 6) > COARSE * size:
             texts.append(
-                f"the film is compressed hard (quantizer {np.median(quantizers):.0f} of 51, {size:.0f} px between the "
-                "eyes): lips and how the head turns may be measured half as well; give the original, or film in a "
-                "higher quality"
+                f"the film is compressed hard (quantizer {steps:.0f} of 51, {size:.0f} px between the eyes): lips and "
+                "how the head turns may be measured half as well; give the original, or film in a higher quality"
             )
         if level < GOOD_LIGHT:
             texts.append(

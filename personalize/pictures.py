@@ -13,15 +13,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
-from personalize.container import (
-    MAX_DURATION_S,
-    Source,
-    display_matrix,
-    frame_time,
-    probe,
-    quantizer,
-    square_size,
-)
+from personalize.container import MAX_DURATION_S, Source, display_matrix, frame_time, probe, square_size
 from personalize.errors import UserError
 from personalize.hdr import HLG, PQ, usual_range
 
@@ -45,21 +37,18 @@ class FrameReader(Iterator[tuple[float, U8]]):
 
     Times are strictly rising. After each step `damaged` says whether that picture was decoded from broken
     data or predicted from such a picture; pictures that do not decode at all are missing. `interlaced`: how many were
-    of two fields. `resized_s`: when their size first changed, s; NaN if it did not. `quantizers`: see `quantizer`, of
-    the pictures that tell, if asked for. Every pass over a file gives the same pictures. Raises UserError like `probe`,
-    beyond the limits, where the clock is set back, where the pictures' shape changes, and of colours that FFmpeg cannot
-    read.
+    of two fields. `resized_s`: when their size first changed, s; NaN if it did not. Every pass over a file gives the
+    same pictures. Raises UserError like `probe`, beyond the limits, where the clock is set back, where the pictures'
+    shape changes, and of colours that FFmpeg cannot read.
     """
 
-    def __init__(self, path: Path | str, max_side: int | None = None, quantizers: bool = False) -> None:
-        """max_side: shrink to at most this many px on the long side. quantizers: note them, 1 ms a picture in HD."""
+    def __init__(self, path: Path | str, max_side: int | None = None) -> None:
+        """max_side: shrink to at most this many px on the long side."""
         self._path = Path(path)
         self._max_side = max_side
         self.info = probe(self._path)
         self.damaged = False
         self.interlaced, self.resized_s = 0, float("nan")
-        self.quantizers: list[float] = []
-        self._decoding = {"export_side_data": "venc_params"} if quantizers else {}
         # One for all pictures: making its tables takes longer than its work.
         self._reformatter = VideoReformatter()
         self._pictures = _ahead(self._read())
@@ -75,15 +64,12 @@ class FrameReader(Iterator[tuple[float, U8]]):
         matrix = np.eye(2, dtype=np.int64)
         with Source(self._path) as source:
             source.video.thread_type = "AUTO"
-            source.video.codec_context.options = self._decoding
             for time, frame in _in_time(source.decode(source.video), start, step, self._path):
                 seen = square_size(source.video, frame)
                 if not size[0]:  # later pictures are scaled to the size of the first
                     matrix, size, whole = display_matrix(frame), self._size(*seen), seen
                 self._check_size(time, whole, seen)
                 self.interlaced += bool(frame.interlaced_frame)
-                if (steps := quantizer(frame)) is not None:
-                    self.quantizers.append(steps)
                 if frame.is_corrupt:
                     damage_end = time + DAMAGE_S
                 elif frame.key_frame:
@@ -133,9 +119,9 @@ class FrameReader(Iterator[tuple[float, U8]]):
         return np.asarray(rgb, np.uint8)
 
 
-def read_frames(path: Path | str, max_side: int | None = None, quantizers: bool = False) -> FrameReader:
-    """Pictures of a video, see FrameReader."""
-    return FrameReader(path, max_side, quantizers)
+def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:
+    """Pictures of a video, see FrameReader. `max_side`: shrink to at most this many px on the long side."""
+    return FrameReader(path, max_side)
 
 
 def _in_time(frames: Iterable[Any], start: float, step: float, path: Path) -> Generator[tuple[float, Any]]:

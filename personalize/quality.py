@@ -23,6 +23,8 @@ COLUMNS = (
 )
 # Of what is between the lips (see tracker.lip_opening): 2 to 16 % in films and clips that are well lit.
 LIKE_LIPS = 0.2
+# See tracker.lip_lines: films and sharp clips have .12 and more, a face of 50 px between the eyes .09.
+FINE = 0.083
 FACING_CAMERA = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
@@ -61,12 +63,19 @@ def frame_reasons(frames: Frames, track: Track, doubts: Sequence[str], least: fl
 
 def lip_warnings(refined: Refined) -> list[str]:
     """What the person should know of how well the openings are read."""
-    if not refined.like_lips > LIKE_LIPS:
-        return []
-    return [
-        f"what is between the lips hardly differs from them ({refined.like_lips:.0%} of it looks like lips): openings "
-        "may be measured a millimetre off; film in better light, sharper, or compressed less"
-    ]
+    texts = []
+    if refined.like_lips > LIKE_LIPS:
+        texts.append(
+            f"what is between the lips hardly differs from them ({refined.like_lips:.0%} of it looks like lips): "
+            "openings may be measured half a millimetre to a millimetre off; film in better light, sharper, or "
+            "compressed less"
+        )
+    if refined.fineness < FINE:
+        texts.append(
+            "the face is out of focus, or its details are lost otherwise: openings may be measured a millimetre too "
+            "wide; focus on the face, clean the lens, film closer"
+        )
+    return texts
 
 
 def read_reasons(path: Path) -> NDArray[np.str_]:

@@ -23,7 +23,8 @@ from tracker.refine import Refined
 from tracker.track import Bundle, Camera, Landmarks, Track
 
 SCHEMA = 1
-VIDEO_KEYS, STAGE_KEYS = {"name", "path", "sha256"}, {"key", "seconds", "outputs"}
+VIDEO_KEYS = {"name": str, "path": str, "sha256": str}
+STAGE_KEYS = {"key": str, "seconds": (int, float), "outputs": dict}
 
 
 def tool_version() -> str:
@@ -36,12 +37,14 @@ def _is_run(state: Any) -> bool:
     if not isinstance(state, dict) or state.get("schema") != SCHEMA:
         return False
     parts = all(isinstance(state.get(key), dict) for key in ("video", "settings", "stages"))
-    if not parts or not state["video"].keys() >= VIDEO_KEYS:
+    if not parts or not _holds(state["video"], VIDEO_KEYS):
         return False
-    entries = state["stages"].values()
-    return all(
-        isinstance(e, dict) and e.keys() >= STAGE_KEYS and isinstance(e["outputs"], dict) for e in entries
-    )
+    return all(isinstance(entry, dict) and _holds(entry, STAGE_KEYS) for entry in state["stages"].values())
+
+
+def _holds(entry: dict[str, Any], kinds: dict[str, Any]) -> bool:
+    """Whether there are values of these kinds under these keys."""
+    return all(isinstance(entry.get(key), kind) for key, kind in kinds.items())
 
 
 class RunFolder:
@@ -194,13 +197,15 @@ def read_features(path: Path) -> FeatureTracks:
 def write_refined(folder: Path, refined: Refined) -> None:
     """`photometric/track.npz` and `photometric/deviation.npz`."""
     write_track(folder / "track.npz", refined.track)
-    write_npz(folder / "deviation.npz", deviation=refined.deviation, like_lips=np.array(refined.like_lips))
+    told = {name: np.asarray(value) for name, value in vars(refined).items() if name != "track"}
+    write_npz(folder / "deviation.npz", **told)
 
 
 def read_refined(folder: Path) -> Refined:
     """Inverse of `write_refined`."""
-    data = read_npz(folder / "deviation.npz")
-    return Refined(read_track(folder / "track.npz"), data["deviation"], float(data["like_lips"]))
+    told = read_npz(folder / "deviation.npz")
+    numbers = {name: float(told.pop(name)) for name in ("like_lips", "fineness")}
+    return Refined(read_track(folder / "track.npz"), told["deviation"], **numbers)
 
 
 def write_camera(folder: Path, camera: Camera, bundle: Bundle) -> None:

@@ -52,7 +52,7 @@ def speech_model_assets(settings: Settings) -> dict[str, str]:
 class Ingest(Stage):
     """Video -> times, usable frames and why not, sound, split."""
 
-    name, version, needs = "ingest", 8, (VIDEO,)
+    name, version, needs = "ingest", 9, (VIDEO,)
     makes = ("media.json", "frames.npz", "audio.wav", "split.json")
 
     def make(self, context: Context, folder: Path) -> None:
@@ -276,7 +276,8 @@ class Evaluate(Stage):
     name, folder, version, reads = "evaluate", "evaluation", 3, ("seed", "overlay", "tracked")
     needs = (
         *(VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv"),
-        *("overlay/preview.mp4", "overlay/contact_sheet.png", "photometric/deviation.npz", *JUDGED),
+        *("overlay/preview.mp4", "overlay/contact_sheet.png", *JUDGED),
+        *("ingest/media.json", "photometric/deviation.npz"),
     )
     makes, products = ("metrics.json", "samples/test.mp4", "samples/test.npz"), ("report.html",)
 

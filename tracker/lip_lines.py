@@ -20,6 +20,7 @@ STEP_MM, REACH_MM = 0.4, 17.0  # of the samples along a line, to both sides of t
 SAMPLES = np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM)
 # Of a grey level: light becomes a sum. Where it is dark, colours are noise.
 LOG = np.log(np.arange(256, dtype=np.float32) + np.float32(8.0))
+FINE_REACH_MM = 12.0
 BLUR = 0.6  # standard deviation in steps, and no less than LEAST_BLUR_PX
 LEAST_BLUR_PX = 0.5
 
@@ -75,3 +76,14 @@ class LipLines:
         out[:, upper] -= move
         out[:, lower] += move
         return out
+
+
+def fineness(colours: U8) -> float:
+    """How fine the light about the mouth is, along lines [n, Q, S, 3]: .25 of sharp edges, .06 of smooth slopes.
+
+    By how much more two samples differ .8 mm apart than .4, against 3.2 mm apart and 1.6 (structure functions); what is
+    noise cancels. Of the middle lines, where they cross the lips.
+    """
+    light = LOG[colours[:, 2:-2, np.abs(SAMPLES) <= FINE_REACH_MM]].mean(-1)
+    apart = {k: float(((light[..., k:] - light[..., :-k]) ** 2).mean()) for k in (1, 2, 4, 8)}
+    return (apart[2] - apart[1]) / max(apart[8] - apart[4], 1e-9)

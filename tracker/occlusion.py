@@ -26,10 +26,9 @@ CONTRAST = 0.02  # of log colour: a region whose pattern is weaker than this can
 LEARNED = 400  # frames, spread over the clip, that the patterns are learned from
 PATTERNS = 4  # components besides the mean: a turned head, other light, an open mouth
 FRAMES_PER_PATTERN = 20  # fewer would make each frame its own pattern
-# Share of the frames that are taken to show the bare face; then those too that look no stranger than this to them, so
-# that what changes little by little, a turn or the light, is followed, and what comes from outside is not.
-TRUSTED, ALIKE = 0.6, 0.08
-TRUSTING, FOLLOWING = 4, 3  # rounds of either
+# Share of the frames that are taken to show the bare face; in the end those too that look no stranger to these than
+# ALIKE: other turns and lights. Not again and again, or the pattern would follow a hand from its first finger on.
+TRUSTED, TRUSTING, ALIKE = 0.5, 4, 0.12  # TRUSTING: rounds
 LEAST_POINTS = 20  # of a region: in a clip of profiles the far side has fewer
 MIDDLE = 0.05  # of the distance between the eyes, to either side
 EYE_REACH = 0.27  # of the distance between the eyes: lids and gaze change within it and cover nothing
@@ -120,10 +119,10 @@ def _strangeness(colour: U8) -> F64:
     learned = np.unique(np.linspace(0, len(colour) - 1, LEARNED).round().astype(int))
     values = _contrasts(colour[learned])
     patterns, mean = np.zeros((0, values.shape[1])), np.median(values, axis=0)
-    for turn in range(TRUSTING + FOLLOWING):
+    for step in range(TRUSTING + 1):
         strange = _unlike(values, mean, patterns)
         count = max(1, round(TRUSTED * len(learned)))
-        if turn >= TRUSTING:
+        if step == TRUSTING:
             count = max(count, int((strange <= ALIKE).sum()))
         taken = np.argsort(strange, kind="stable")[:count]
         mean = values[taken].mean(0)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tracker.energy import landmark_model
 from tracker.fit import at_rest, make_track, resume, runs, smoothness_between, trusted, with_lips_shut
 from tracker.key_frames import key_frames
-from tracker.lip_lines import LipLines
+from tracker.lip_lines import LipLines, fineness
 from tracker.lip_motion import steadied
 from tracker.lip_opening import lip_edges
 from tracker.rigid_pose import hold_poses, turned_as_far
@@ -41,12 +41,14 @@ class Refined:
     """A track, and what speaks against it.
 
     deviation: [T, 2] mean deviation of the grey levels, of all skin and of the mouth's, 1 in the clip's median; NaN
-    where nothing was compared. like_lips: see `lip_edges`; NaN where no colours were read.
+    where nothing was compared. like_lips: see `lip_edges`; fineness: of the lips, see `tracker.lip_lines.fineness`; NaN
+    where no colours were read.
     """
 
     track: Track
     deviation: F32
     like_lips: float = np.nan
+    fineness: float = np.nan
 
 
 def refine_track(
@@ -126,7 +128,8 @@ def refine_track(
     if rigid:
         refined = hold_poses(refined, bundle, good, run, time, sound, HALFWAY)
     out = make_track(landmarks, camera, head, subject.energy, opened, identity, refined, good)
-    return Refined(out, _relative(deviation, good, len(track.time)), like_lips)
+    fine = fineness(np.stack([colours[row] for row in rows]))
+    return Refined(out, _relative(deviation, good, len(track.time)), like_lips, fine)
 
 
 def _read_widths(

@@ -13,7 +13,14 @@ import pytest
 
 from personalize.container import probe
 from personalize.errors import UserError
-from personalize.ingest import MIN_USABLE_S, _form, _without_sound, find_usable, ingest_video
+from personalize.ingest import (
+    MIN_USABLE_S,
+    _check_upright,
+    _form,
+    _without_sound,
+    find_usable,
+    ingest_video,
+)
 from personalize.people import FaceFollower, Sighting, Tracklet, main_person, sureness_of_turns
 from personalize.shots import (
     REASONS,
@@ -315,6 +322,24 @@ def test_a_picture_that_is_turned_is_refused(
             find_usable(probe(path))
     else:
         assert find_usable(probe(path))[0].usable.any()
+
+
+@pytest.mark.parametrize(
+    ("turned", "upright", "unseen", "refused"),
+    [(3, 0, 0, False), (4, 0, 0, True), (6, 4, 0, False), (8, 2, 0, True), (3, 0, 9, False)],
+)
+def test_three_quarters_of_four_looks_and_more_tell_that_a_picture_is_turned(
+    turned: int, upright: int, unseen: int, refused: bool
+) -> None:
+    each = {"turned": [0.6, 0.8, 0.9, 0.8], "upright": [0.9, 0.8, 0.6, 0.8], "unseen": [0.0, 0.7, 0.0, 0.0]}
+    numbers = {"turned": turned, "upright": upright, "unseen": unseen}
+    turns = [np.array(each[kind]) for kind, count in numbers.items() for _ in range(count)]
+    media = SimpleNamespace(path="clip.mp4")
+    if refused:
+        with pytest.raises(UserError, match="upside down"):
+            _check_upright(media, [], turns)
+    else:
+        _check_upright(media, [], turns)
 
 
 def test_a_head_on_its_side_is_told_so_whatever_the_detector_finds_surer(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import struct
 import threading
 import time
 from collections.abc import Generator
@@ -13,8 +14,9 @@ from types import SimpleNamespace
 import av
 import numpy as np
 import pytest
+from av.sidedata.sidedata import Type as SideData
 
-from personalize.container import probe
+from personalize.container import _quantizer, probe, quantizer
 from personalize.errors import UserError
 from personalize.pictures import _ahead, _in_time, _turned, read_frames
 from personalize.sound import on_video_clock, read_audio, write_wav
@@ -200,21 +202,33 @@ def test_interlaced_pictures_are_counted(tmp_path: Path, flags: str, woven: int)
     # Of ten bits x264 counts from -12: the file comes out as large as that of eight at 40.
     [("yuv420p", 20, 20), ("yuv420p", 40, 40), ("yuv420p10le", 52, 40)],
 )
-def test_how_coarsely_pictures_are_coded_is_known(tmp_path: Path, pixels: str, told: int, steps: int) -> None:
+def test_how_coarsely_a_film_is_coded_is_known(tmp_path: Path, pixels: str, told: int, steps: int) -> None:
     rng = np.random.default_rng(0)  # noise, so that no block is left out
     pictures = [rng.integers(0, 255, (64, 96, 3), np.uint8) for _ in range(25)]
     constant = {"x264-params": f"qp={told}:ipratio=1:bframes=0:aq-mode=0"}
     path = write_video(tmp_path / "v.mp4", pictures, STEADY, pixels=pixels, options=constant)
-    reader = read_frames(path, quantizers=True)
-    assert len(list(reader)) == len(reader.quantizers) == 25
-    np.testing.assert_allclose(reader.quantizers, steps, atol=0.5)
+    assert quantizer(path) == pytest.approx(steps, abs=0.5)
 
 
-def test_other_codecs_do_not_tell_how_coarsely_pictures_are_coded(tmp_path: Path) -> None:
-    for codec, quantizers in (("mpeg4", True), ("libx264", False)):
-        path = write_video(tmp_path / f"{codec}.mp4", moving(5), STEADY[:5], codec=codec)
-        reader = read_frames(path, quantizers=quantizers)
-        assert len(list(reader)) == 5 and reader.quantizers == []
+def test_a_pictures_quantizer_is_the_mean_of_its_blocks() -> None:
+    class Side(bytes):
+        type = SideData.VIDEO_ENC_PARAMS
+
+    def picture(kind: int) -> SimpleNamespace:
+        head = struct.pack("<IxxxxQQii", 3, 64, 20, kind, 30).ljust(64, b"\0")
+        blocks = b"".join(
+            struct.pack("<5i", 16 * k, 0, 16, 16, beyond) for k, beyond in enumerate((-2, 1, 10))
+        )
+        components = [SimpleNamespace(bits=8)]
+        return SimpleNamespace(side_data=[Side(head + blocks)], format=SimpleNamespace(components=components))
+
+    assert _quantizer(picture(1)) == 33
+    assert _quantizer(picture(0)) is None, "VP9 has another scale"
+
+
+@pytest.mark.parametrize("codec", ["mpeg4", "libx265"])
+def test_other_codecs_do_not_tell_how_coarsely_they_code(tmp_path: Path, codec: str) -> None:
+    assert np.isnan(quantizer(write_video(tmp_path / "v.mp4", moving(5), STEADY[:5], codec=codec)))
 
 
 @pytest.mark.parametrize("colours", [8, 14])

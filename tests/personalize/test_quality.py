@@ -3,15 +3,17 @@
 import csv
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
 
 from personalize.evaluation.report import _apart
 from personalize.pipeline import STAGES
-from personalize.quality import frame_reasons, left_out, lip_warnings, read_reasons, write_quality
-from personalize.run import read_refined, write_refined
+from personalize.quality import frame_reasons, left_out, read_reasons, write_quality
+from personalize.run import write_refined
 from personalize.shots import REASONS, Frames
+from personalize.stages import Refine
 from tests.personalize.test_registration import track_of
 from tracker.head import load_head
 from tracker.refine import Refined
@@ -55,14 +57,31 @@ def test_another_threshold_judges_again_and_makes_nothing_else():
 
 
 @pytest.mark.parametrize(
-    ("like_lips", "text"), [(np.nan, None), (0.16, None), (0.31, "31% of it looks like lips"), (0.7, "70%")]
+    ("like_lips", "fineness", "said"),
+    [
+        (np.nan, np.nan, []),
+        (0.16, 0.09, []),
+        (0.31, 0.2, ["31% of it looks like lips"]),
+        (0.7, 0.07, ["70% of it", "out of focus"]),
+    ],
 )
-def test_a_mouth_whose_inside_looks_like_lips_is_told_of(
-    track, tmp_path: Path, like_lips: float, text: str | None
+def test_how_badly_lips_are_seen_is_told_when_made_and_when_cached(
+    track, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, like_lips: float, fineness: float, said: list[str]
 ):
-    write_refined(tmp_path, Refined(track, np.ones((6, 2), np.float32), like_lips))
-    (told,) = lip_warnings(read_refined(tmp_path)) or [None]
-    assert (text in told) if text else told is None
+    (tmp_path / "photometric").mkdir()
+    refined = Refined(track, np.ones((6, 2), np.float32), like_lips, fineness)
+    write_refined(tmp_path / "photometric", refined)
+    texts = Refine().warnings(Mock(path=tmp_path))
+    assert len(texts) == len(said) and all(words in text for words, text in zip(said, texts))
+    for name in ("read_track", "read_landmarks", "read_frames", "read_appearance"):
+        monkeypatch.setattr(f"personalize.run.{name}", Mock())
+    monkeypatch.setattr("personalize.run.read_camera", lambda _: (Mock(), Mock()))
+    for name in ("run_head", "bare"):
+        monkeypatch.setattr(f"personalize.stages.{name}", Mock())
+    monkeypatch.setattr("personalize.stages.refine_track", lambda *_, **__: refined)
+    context = MagicMock()
+    Refine().make(context, tmp_path / "photometric")
+    assert [call.args[0] for call in context.report.warn.call_args_list] == texts
 
 
 def test_spans_end_where_the_next_frame_begins():

@@ -236,6 +236,8 @@ def test_another_videos_folder_is_refused(context: Context, tmp_path: Path) -> N
         lambda state: state["stages"].update(double="done"),
         lambda state: state["stages"]["double"].pop("outputs"),
         lambda state: state["stages"]["double"].update(outputs=[]),
+        lambda state: state["stages"]["double"].update(seconds=None),
+        lambda state: state["video"].update(path=None),
     ],
 )
 def test_a_run_json_that_somebody_has_edited_is_refused(

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
-from tracker.lip_lines import SAMPLES
+from tracker.lip_lines import SAMPLES, fineness
 from tracker.lip_opening import _lit_edge, lip_edges
 
 FRAMES, LIP_MM = 80, 7.0
@@ -135,3 +136,15 @@ def test_what_covers_the_mouth_teaches_nothing(openings: tuple[np.ndarray, np.nd
     alone = lip_widths(painted(true)[bare], marked(seen)[bare], bare)
     np.testing.assert_allclose(lip_widths(hand, marked(seen), bare)[bare], alone)
     assert lip_widths(hand, marked(seen), ALL[:0]) is None
+
+
+@pytest.mark.parametrize("noise", [0.0, 25.0])
+def test_soft_pictures_are_told_from_sharp_ones_whatever_their_noise(
+    openings: tuple[np.ndarray, np.ndarray], noise: float
+):
+    true, _ = openings
+    sharp = painted(true, soft_mm=0.4)
+    soft = gaussian_filter1d(sharp.astype(float), 3.0, axis=2)  # 1.2 mm
+    grain = noise * np.random.default_rng(2).normal(size=sharp.shape)
+    fine = [fineness(np.clip(picture + grain, 0, 255).astype(np.uint8)) for picture in (sharp, soft)]
+    assert fine[1] < 0.13 < 0.3 < fine[0]

@@ -95,11 +95,12 @@ def test_a_mouth_that_is_covered_looks_strange_whether_it_came_at_once_or_slowly
     assert seen.strangeness[covered == 0].max() < 0.08
 
 
-def test_a_mouth_that_is_covered_on_one_side_looks_strange():
-    covered = np.clip((np.arange(FRAMES) - 25) / 3, 0, 1)
+@pytest.mark.parametrize("rise", [3, 12])
+def test_a_mouth_that_is_covered_on_one_side_looks_strange_however_slowly_it_came(rise):
+    covered = np.clip((np.arange(FRAMES) - 22) / rise, 0, 1)
     covered[45:] = 0
     seen = look(*clip(covered, wide=0.4, cover=np.full((SIDE, SIDE, 3), 130, np.uint8)))
-    assert seen.strangeness[covered > 0.6].min() > 0.22
+    assert seen.strangeness[covered == 1].min() > 0.22
     assert seen.strangeness[covered == 0].max() < 0.08
 
 

@@ -135,7 +135,9 @@ def test_pictures_lower_the_error(film: Film):
 
 
 def test_a_dark_mouth_lowers_the_openings_error(dark_mouth: Film):
-    error = opening_error_mm(dark_mouth.refine().track, dark_mouth.gap)
+    refined = dark_mouth.refine()
+    assert 0 < refined.like_lips < 0.1 < refined.fineness < 1
+    error = opening_error_mm(refined.track, dark_mouth.gap)
     assert error < 0.7 * opening_error_mm(dark_mouth.track, dark_mouth.gap)
 
 
