@@ -20,16 +20,15 @@ from personalize.recorded_lens import recorded_focal_mm
 MAX_DURATION_S = 4 * 3600.0
 MATROSKA = "matroska,webm"
 MAX_SIDE_PX = 16_384
-# FFmpeg's AVVideoEncParams: how many blocks from where, of what size, on which scale, and the steps that theirs, behind
+# FFmpeg's AVVideoEncParams: how many blocks from where, of what size, and the steps that theirs, which stand behind
 # place and size of each, are beyond.
 _CODED_BLOCKS = np.dtype(
     {
-        "names": ["count", "at", "size", "kind", "steps"],
-        "formats": ["<u4", "<u8", "<u8", "<i4", "<i4"],
-        "offsets": [0, 8, 16, 24, 28],
+        "names": ["count", "at", "size", "steps"],
+        "formats": ["<u4", "<u8", "<u8", "<i4"],
+        "offsets": [0, 8, 16, 28],
     }
 )
-_H264_QUANTIZER = 1
 QUANTIZER_FRAMES = 40  # that tell of it
 STILL_FORMATS = ("_pipe", "image2", "gif")  # ends of the names of FFmpeg's readers of pictures
 
@@ -187,6 +186,8 @@ def display_matrix(frame: Any) -> NDArray[np.int64]:
 def quantizer(path: Path) -> float:
     """How coarsely a film begins to be coded, 0 to 51, in the median picture; NaN unless it is H.264."""
     with Source(path) as source:
+        if source.video is None or source.video.codec_context.name != "h264":
+            return np.nan
         # By one thread: with several, a picture is handed out while the steps of its blocks are still filled in.
         source.video.thread_type, source.video.codec_context.thread_count = "NONE", 1
         source.video.codec_context.options = {"export_side_data": "venc_params"}
@@ -196,13 +197,11 @@ def quantizer(path: Path) -> float:
 
 
 def _quantizer(frame: Any) -> float | None:
-    """Of one picture, the mean of its blocks."""
+    """Of a picture of H.264, the mean of its blocks; None if it does not tell."""
     for side in frame.side_data:
         if side.type == SideData.VIDEO_ENC_PARAMS:
             data = memoryview(side)
             blocks = np.frombuffer(data, _CODED_BLOCKS, count=1)[0]
-            if blocks["kind"] != _H264_QUANTIZER or not blocks["count"]:
-                break
             each = np.frombuffer(data, np.uint8, blocks["count"] * blocks["size"], blocks["at"])
             beyond = each.reshape(blocks["count"], -1)[:, 16:20].copy().view("<i4")
             return float(blocks["steps"] + beyond.mean()) - 6 * (frame.format.components[0].bits - 8)
