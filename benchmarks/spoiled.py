@@ -1,0 +1,223 @@
+"""How a clip is tracked when its film is spoiled, and whether that is told: `python -m benchmarks spoiled VIDEO ...`.
+
+The first seconds of a video are written anew as they are, and spoiled: compressed, in other light, with noise, out of
+focus, without colours, and with things pasted over the mouth. Each goes through the command up to `judge`.
+
+used            frames that are used by default, %
+bare out        of those that nothing covers, which are left out; %
+covered used    of those in which the mouth is covered all the way, which are used; %
+rmse, bias, r   lip opening of the used frames without a cover against the copy that is not spoiled, mm
+warnings        how each begins
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from personalize.container import probe
+from personalize.pictures import read_frames
+from personalize.quality import read_reasons
+from personalize.run import read_landmarks, read_track
+from personalize.sound import on_video_clock, read_audio
+from personalize.video_writer import VideoWriter
+from tracker.landmark_indices import LEFT_EYE_OUTER, LIPS, POINTS, RIGHT_EYE_OUTER
+from tracker.track import F32
+
+U8 = NDArray[np.uint8]
+Picture = Callable[[U8, F32], U8]  # of a picture [H, W, 3] and its landmarks [478, 2] px
+
+SECONDS = 13.0
+GAMMA = 2.2
+FOREHEAD = 151
+DARK = (28, 25, 25)
+BELOW = 1.3  # of the distance between the eyes: how far under the mouth a cover comes from
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Something that comes over the mouth from below at the `times`, s, within `ramp` s, and stays for `hold` s.
+
+    skin: as the forehead, or a dark ball. wide: of the distance between the eyes. aside: of that, to the left.
+    """
+
+    times: tuple[float, ...]
+    ramp: float
+    hold: float
+    skin: bool = True
+    wide: float = 1.0
+    aside: float = 0.0
+
+    def near(self, time: float) -> float:
+        """0..1, 1 where it covers the mouth."""
+        inside = (min(time - t, t + 2 * self.ramp + self.hold - time) / self.ramp for t in self.times)
+        return float(np.clip(max(inside), 0, 1))
+
+    def over(self, rgb: U8, points: F32, near: float) -> U8:
+        """The picture with it."""
+        if near == 0 or not np.isfinite(points).all():
+            return rgb
+        out = rgb.copy()
+        eyes = float(np.linalg.norm(points[LEFT_EYE_OUTER] - points[RIGHT_EYE_OUTER]))
+        middle = points[list(LIPS)].mean(0) + eyes * np.array([self.aside, BELOW * (1 - near)])
+        if not self.skin:
+            return cv2.circle(out, middle.round().astype(int).tolist(), round(self.wide * eyes / 2), DARK, -1)
+        width, height = round(self.wide * eyes), round(0.75 * eyes)
+        left, top = (middle - (width / 2, height / 2)).round().astype(int)
+        skin = _around(rgb, points[FOREHEAD], 0.28 * eyes, 0.14 * eyes)
+        fingers = 0.9 + 0.12 * np.sin(12 * np.linspace(0, 1, width))[None, :, None]
+        patch = np.clip(cv2.resize(skin, (width, height)) * fingers, 0, 255)
+        low, high = np.maximum((top, left), 0), np.minimum((top + height, left + width), rgb.shape[:2])
+        if (high > low).all():
+            shown = patch[low[0] - top : high[0] - top, low[1] - left : high[1] - left]
+            out[low[0] : high[0], low[1] : high[1]] = shown
+        return out
+
+
+def _around(rgb: U8, place: F32, wide: float, high: float) -> U8:
+    """A rectangle of the picture, at least a pixel large."""
+    reach = np.array([wide, high])
+    left, top = np.maximum(place - reach, 0).astype(int)
+    right, bottom = np.maximum(place + reach, (left + 1, top + 1)).astype(int)
+    return rgb[top:bottom, left:right]
+
+
+def lit(factor: float) -> Picture:
+    """With so many times the light, in eight bits."""
+    light = np.clip(factor * (np.arange(256) / 255) ** GAMMA, 0, 1)
+    levels = np.round(255 * light ** (1 / GAMMA)).astype(np.uint8)
+    return lambda rgb, _: levels[rgb]
+
+
+def noisy(deviation: float) -> Picture:
+    """With white noise, grey levels."""
+    random = np.random.default_rng(0)
+    return lambda rgb, _: np.clip(
+        rgb + deviation * random.standard_normal(rgb.shape, np.float32) + 0.5, 0, 255
+    ).astype(np.uint8)
+
+
+def blurred(share: float) -> Picture:
+    """By a Gaussian whose standard deviation is a share of the distance between the eyes."""
+
+    def change(rgb: U8, points: F32) -> U8:
+        eyes = float(np.linalg.norm(points[LEFT_EYE_OUTER] - points[RIGHT_EYE_OUTER]))
+        return np.asarray(cv2.GaussianBlur(rgb, (0, 0), share * eyes), np.uint8) if np.isfinite(eyes) else rgb
+
+    return change
+
+
+def as_it_is(rgb: U8, _: F32) -> U8:
+    """The same."""
+    return rgb
+
+
+def grey(rgb: U8, _: F32) -> U8:
+    """Without colours."""
+    return np.repeat(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
+
+
+# Name -> what is done to each picture, x264's crf.
+WHOLE = "as it is"
+SPOILED: dict[str, tuple[Picture | Cover, int]] = {
+    WHOLE: (as_it_is, 12),
+    "crf 30": (as_it_is, 30),
+    "crf 36": (as_it_is, 36),
+    "three times the light": (lit(3), 18),
+    "a tenth of the light": (lit(0.1), 18),
+    "noise": (noisy(30), 18),
+    "out of focus": (blurred(0.021), 18),
+    "no colours": (grey, 18),
+    "a hand, four times": (Cover((1.5, 4.5, 7.5, 10.0), 0.3, 0.7), 18),
+    "half a hand, slowly": (Cover((3.0,), 2.0, 2.0, wide=0.55, aside=0.28), 18),
+    "a ball, for 5.5 s": (Cover((1.0,), 0.5, 5.5, skin=False, wide=0.56, aside=-0.1), 18),
+}
+
+
+def write_spoiled(video: Path, out: Path, way: Picture | Cover, crf: int, points: F32) -> None:
+    """The first SECONDS of a video, spoiled. points: [T, 478, 2] px, its landmarks; fewer count as none."""
+    info = probe(video)
+    sound = on_video_clock(*read_audio(video), SECONDS)
+    none = np.full((POINTS, 2), np.nan, np.float32)
+    with VideoWriter(out, info.fps, (info.width, info.height), sound, crf=crf) as writer:
+        for frame, (time, rgb) in enumerate(read_frames(video)):
+            if time >= SECONDS:
+                break
+            marks = points[frame] if frame < len(points) else none
+            changed = way.over(rgb, marks, way.near(time)) if isinstance(way, Cover) else way(rgb, marks)
+            writer.write(changed, time)
+
+
+def opening_errors(run: Path, whole: Path, cover: Cover | None) -> list[float]:
+    """[6]: used, bare out, covered used, %; RMSE, bias, mm, and r of the openings against the run `whole`."""
+    track, right = (read_track(folder / "refine/track.npz") for folder in (run, whole))
+    used = read_reasons(run / "refine/quality.csv") == "ok"
+    near = np.array([cover.near(time) if cover else 0.0 for time in track.time])
+    bare, covered = near == 0, near == 1
+    known = used & bare & np.isin(np.round(track.time, 3), np.round(right.time[right.valid], 3))
+    found, true = track.lip_gap_mm[known], np.interp(track.time[known], right.time, right.lip_gap_mm)
+    error = (found - true).astype(np.float64)
+    shares = [used.mean(), 1 - used[bare].mean(), used[covered].mean() if covered.any() else np.nan]
+    r = float(np.corrcoef(found, true)[0, 1])
+    return [
+        *(100 * float(share) for share in shares),
+        float(np.sqrt((error**2).mean())),
+        float(error.mean()),
+        r,
+    ]
+
+
+def main() -> None:
+    """Spoil, run and print, one video after the other."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("videos", type=Path, nargs="+")
+    for video in parser.parse_args().videos:
+        columns = ("bare out", 10), ("covered used", 14), ("rmse", 7), ("bias", 7), ("r", 7)
+        print(
+            f"\n{video.name}\n{'':24s}{'used':>6s}", *(f"{name:>{wide}s}" for name, wide in columns), sep=""
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            spoil(video, Path(folder))
+
+
+def spoil(video: Path, folder: Path) -> None:
+    """All ways, in a folder for films and runs."""
+    points, whole = np.zeros((0, POINTS, 2), np.float32), folder / f"{WHOLE}.run"
+    for name, (way, crf) in SPOILED.items():
+        film, run = folder / f"{name}.mp4", folder / f"{name}.run"
+        write_spoiled(video, film, way, crf, points)
+        command = [sys.executable, "-m", "cli.main", "run", str(film), "--out", str(run), "--until", "judge"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            print(
+                f"{name:24s} refused: {done.stderr.strip().removeprefix(f'personalize: {film}: ')[:90]}",
+                flush=True,
+            )
+            continue
+        if name == WHOLE:
+            points = read_landmarks(run / "landmarks/landmarks.npz").points[..., :2]
+        used, out, covered, rmse, bias, r = opening_errors(
+            run, whole, way if isinstance(way, Cover) else None
+        )
+        warned = [
+            line[9:45]
+            for line in done.stdout.splitlines()
+            if line.startswith("warning: ") and "only" not in line
+        ]
+        print(
+            f"{name:24s}{used:6.1f}{out:10.1f}{covered:14.1f}{rmse:7.2f}{bias:7.2f}{r:7.3f}  {'; '.join(warned)}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""Films are spoiled as they are said to be, and openings compared where nothing covers the mouth."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.spoiled import SPOILED, Cover, blurred, lit, noisy, opening_errors, write_spoiled
+from personalize.pictures import read_frames
+from personalize.run import write_track
+from tests.personalize.test_registration import track_of
+from tests.personalize.video_factory import write_video
+from tracker.head import load_head
+from tracker.landmark_indices import LEFT_EYE_OUTER, LIPS, POINTS, RIGHT_EYE_OUTER
+
+EYES_PX = 80.0
+
+
+@pytest.fixture
+def points() -> np.ndarray:
+    """[478, 2] px: a mouth in the middle of 240 x 200 px, eyes above."""
+    points = np.tile(np.float32([120, 60]), (POINTS, 1))
+    points[list(LIPS)] = 120, 120
+    points[LEFT_EYE_OUTER], points[RIGHT_EYE_OUTER] = (160, 50), (80, 50)
+    return points
+
+
+def test_a_cover_comes_stays_and_goes() -> None:
+    cover = Cover((1.0, 5.0), ramp=0.5, hold=1.0)
+    assert [cover.near(t) for t in (0.9, 1.25, 1.5, 2.5, 2.75, 3.0, 5.75)] == [0, 0.5, 1, 1, 0.5, 0, 1]
+
+
+@pytest.mark.parametrize("skin", [True, False])
+def test_a_cover_lies_on_the_mouth_when_it_is_there_and_below_before(points: np.ndarray, skin: bool) -> None:
+    rgb = np.random.default_rng(0).integers(90, 250, (200, 240, 3), np.uint8)
+    cover = Cover((0.0,), 1.0, 1.0, skin=skin, wide=0.5)
+    changed = (cover.over(rgb, points, 1.0) != rgb).any(2)
+    assert changed[112:128, 108:132].mean() > 0.95 and not changed[:85].any()
+    assert not (cover.over(rgb, points, 0.1) != rgb).any(2)[:150].any(), "an eye's distance farther down"
+    assert cover.over(rgb, points, 0.0) is rgb
+    assert cover.over(rgb, np.full_like(points, np.nan), 1.0) is rgb
+
+
+def test_light_noise_and_focus(points: np.ndarray) -> None:
+    flat = np.full((60, 60, 3), 100, np.uint8)
+    # Three times the light in gamma 2.2 is 3 ** (1 / 2.2) times the level.
+    assert lit(3)(flat, points)[0, 0, 0] == round(100 * 3 ** (1 / 2.2))
+    assert lit(3)(flat + 120, points).min() == 255
+    assert noisy(10)(flat, points).std() == pytest.approx(10, rel=0.05)
+    edge = np.zeros((80, 80, 3), np.uint8)
+    edge[:, 40:] = 200
+    slope = np.gradient(blurred(0.05)(edge, points)[40, :, 0].astype(float))
+    places = np.arange(80)
+    spread = np.sqrt((slope * (places - 39.5) ** 2).sum() / slope.sum())
+    assert spread == pytest.approx(0.05 * EYES_PX, abs=0.3)
+
+
+def test_a_film_is_written_again_at_its_times(tmp_path: Path, points: np.ndarray) -> None:
+    times = [0.0, 0.04, 0.12, 0.2]
+    pictures = [np.full((64, 96, 3), 60 + 40 * k, np.uint8) for k in range(4)]
+    path = write_video(tmp_path / "v.mp4", pictures, times)
+    way, crf = SPOILED["as it is"]
+    write_spoiled(path, tmp_path / "out.mp4", way, crf, points[None])
+    again = list(read_frames(tmp_path / "out.mp4"))
+    assert [time for time, _ in again] == pytest.approx(times, abs=1e-3)
+    assert [rgb.mean() for _, rgb in again] == pytest.approx([60, 100, 140, 180], abs=3)
+
+
+def test_openings_are_compared_where_nothing_covers_the_mouth(tmp_path: Path) -> None:
+    head, time = load_head(), np.arange(50) / 25
+    track = track_of(head, np.zeros((50, len(head.expression_basis))), time)
+    gap = 3 + 3 * np.sin(time * 9).astype(np.float32)
+    cover = Cover((1.0,), 0.2, 0.2)
+    near = np.array([cover.near(t) for t in time])
+    wrong = np.where(near > 0, gap + 5, gap + 0.5).astype(np.float32)
+    reasons = ["occluded" if n == 1 and t < 1.3 else "ok" for n, t in zip(near, time)]
+    reasons[3] = "blurred"
+    for name, opening in (("whole", gap), ("spoiled", wrong)):
+        (tmp_path / name / "refine").mkdir(parents=True)
+        write_track(tmp_path / name / "refine/track.npz", replace(track, lip_gap_mm=opening))
+        (tmp_path / name / "refine/quality.csv").write_text("reason\n" + "\n".join(reasons) + "\n")
+    used, bare_out, covered_used, rmse, bias, r = opening_errors(
+        tmp_path / "spoiled", tmp_path / "whole", cover
+    )
+    assert used == pytest.approx(100 * reasons.count("ok") / 50)
+    assert bare_out == pytest.approx(100 / (near == 0).sum())
+    assert covered_used == pytest.approx(100 * ((near == 1) & (time >= 1.3)).sum() / (near == 1).sum())
+    assert (rmse, bias, r) == pytest.approx((0.5, 0.5, 1.0), abs=1e-3)
