@@ -40,6 +40,7 @@ SECONDS = 13.0
 GAMMA = 2.2
 FOREHEAD = 151
 DARK = (28, 25, 25)
+WARNED = 36  # characters
 BELOW = 1.3  # of the distance between the eyes: how far under the mouth a cover comes from
 
 
@@ -197,24 +198,19 @@ def spoil(video: Path, folder: Path) -> None:
         write_spoiled(video, film, way, crf, points)
         command = [sys.executable, "-m", "cli.main", "run", str(film), "--out", str(run), "--until", "judge"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
+        lines = done.stderr.splitlines()
         if done.returncode:
-            print(
-                f"{name:24s} refused: {done.stderr.strip().removeprefix(f'personalize: {film}: ')[:90]}",
-                flush=True,
-            )
+            print(f"{name:24s}refused: {lines[-1].removeprefix(f'personalize: {film}: ')[:90]}", flush=True)
             continue
         if name == WHOLE:
             points = read_landmarks(run / "landmarks/landmarks.npz").points[..., :2]
         used, out, covered, rmse, bias, r = opening_errors(
             run, whole, way if isinstance(way, Cover) else None
         )
-        warned = [
-            line[9:45]
-            for line in done.stdout.splitlines()
-            if line.startswith("warning: ") and "only" not in line
-        ]
+        said = [line.removeprefix("warning: ") for line in lines if line.startswith("warning: ")]
+        warned = "; ".join(text[:WARNED] for text in said if "of usable face" not in text)
         print(
-            f"{name:24s}{used:6.1f}{out:10.1f}{covered:14.1f}{rmse:7.2f}{bias:7.2f}{r:7.3f}  {'; '.join(warned)}",
+            f"{name:24s}{used:6.1f}{out:10.1f}{covered:14.1f}{rmse:7.2f}{bias:7.2f}{r:7.3f}  {warned}",
             flush=True,
         )
 
