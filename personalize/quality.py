@@ -72,8 +72,8 @@ def lip_warnings(refined: Refined) -> list[str]:
         )
     if refined.fineness < FINE:
         texts.append(
-            "the face is out of focus, or its details are lost otherwise: openings may be measured a millimetre too "
-            "wide; focus on the face, clean the lens, film closer"
+            "the face is out of focus, or its details are lost otherwise: openings may be measured one or two "
+            "millimetres too wide; focus on the face, clean the lens, film closer"
         )
     return texts
 
