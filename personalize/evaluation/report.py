@@ -50,7 +50,7 @@ def write_report(run: RunFolder, evaluation: Evaluation, settings: Settings, fol
         video=run.video.name,
         version=tool_version(),
         when=time.strftime("%Y-%m-%d %H:%M"),
-        warnings=[*media["warnings"], *lip_warnings(read_refined(run.path / "photometric"))],
+        warnings=_warnings(run, media),
         cards=_cards(metrics["systems"], duration, float(used.mean())),
         overlay=_data_url(run.path / "overlay/preview.mp4", "video/mp4"),
         modes=[{"name": mode, "meaning": MODES[mode]} for mode in settings.overlay],
@@ -110,6 +110,11 @@ def _focal(run: RunFolder, tracked: str | None) -> str:
         return f"{read_track(run.path / 'refine/track.npz').focal:.0f} px (as {Path(tracked).resolve().name} has it)"
     camera, _ = read_camera(run.path / "camera")
     return f"{camera.focal_px:.0f} px ± {camera.focal_sd_log * 100:.0f} % ({camera.method}; {camera.prior})"
+
+
+def _warnings(run: RunFolder, media: dict[str, Any]) -> list[str]:
+    """What ails the whole clip."""
+    return [*media["warnings"], *lip_warnings(read_refined(run.path / "photometric"))]
 
 
 def _facts(run: RunFolder, media: dict[str, Any], tracked: str | None) -> list[dict[str, str]]:

@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import av
@@ -18,9 +20,9 @@ import pytest
 from model.checkpoint import Checkpoint
 from model.motion import Motion
 from personalize.demo import true_errors
-from personalize.evaluation.report import _facts
+from personalize.evaluation.report import _facts, _warnings
 from personalize.pictures import read_frames
-from personalize.run import RunFolder, read_track
+from personalize.run import RunFolder, read_refined, read_track, write_refined
 from personalize.sound import read_audio
 from personalize.talkers.film import ASSETS, Truth, demo_identity, render_talker
 from personalize.talkers.motion import talker_motion
@@ -116,6 +118,18 @@ def test_the_report_needs_no_other_file(finished: Path) -> None:
     page = (finished / "report.html").read_text()
     assert re.findall(r"(?:src|href)=\"(?!data:|#)", page) == []
     assert "personalized" in page and "data:video/mp4;base64," in page
+
+
+def test_the_report_tells_what_ails_the_clip(finished: Path, tmp_path: Path) -> None:
+    media = json.loads((finished / "ingest/media.json").read_text())
+    page = unescape((finished / "report.html").read_text())
+    assert media["warnings"] and all(text in page for text in media["warnings"])
+    out = tmp_path / "unlike"
+    shutil.copytree(finished, out)
+    refined = read_refined(out / "photometric")
+    write_refined(out / "photometric", replace(refined, like_lips=0.4))
+    texts = _warnings(RunFolder.open(out), media)
+    assert len(texts) == len(media["warnings"]) + 1 and "40% of it looks like lips" in texts[-1]
 
 
 def test_a_report_of_another_trackers_result_is_of_its_camera(finished: Path, tmp_path: Path) -> None:
