@@ -59,8 +59,8 @@ TURN_SHARE, SURER = 0.75, 0.05
 SILENCE = 1e-3  # peak of the sound, -60 dB
 MOST_SILENT_S = 1.0  # of pictures before the sound begins or after it ends
 MOST_INTERLACED = 0.5  # share of the pictures
-# Of the picture's details, for each px between the eyes; they double with every sixth step of H.264's quantizer, of
-# which telephones and webcams have 16 to 27.
+# Steps of grey, as a share of H.264's at quantizer 0, for each px between the eyes, above which openings err by half a
+# millimetre more. They double with every six of the quantizer, of which telephones and webcams have 16 to 27.
 COARSE = 0.3
 MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it for no longer
 
