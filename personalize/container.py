@@ -186,7 +186,7 @@ def display_matrix(frame: Any) -> NDArray[np.int64]:
 def quantizer(path: Path) -> float:
     """How coarsely a film begins to be coded, 0 to 51, in the median picture; NaN unless it is H.264."""
     with Source(path) as source:
-        if source.video is None or source.video.codec_context.name != "h264":
+        if source.video.codec_context.name != "h264":
             return np.nan
         # By one thread: with several, a picture is handed out while the steps of its blocks are still filled in.
         source.video.thread_type, source.video.codec_context.thread_count = "NONE", 1

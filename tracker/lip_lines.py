@@ -21,6 +21,7 @@ SAMPLES = np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM)
 # Of a grey level: light becomes a sum. Where it is dark, colours are noise.
 LOG = np.log(np.arange(256, dtype=np.float32) + np.float32(8.0))
 FINE_REACH_MM = 12.0
+FLAT = 1e-5  # of squared LOG: two faces behind fog that leaves a third of the contrast have .001
 BLUR = 0.6  # standard deviation in steps, and no less than LEAST_BLUR_PX
 LEAST_BLUR_PX = 0.5
 
@@ -82,8 +83,9 @@ def fineness(colours: U8) -> float:
     """How fine the light about the mouth is, along lines [n, Q, S, 3]: .25 of sharp edges, .06 of smooth slopes.
 
     By how much more two samples differ .8 mm apart than .4, against 3.2 mm apart and 1.6 (structure functions); what is
-    noise cancels. Of the middle lines, where they cross the lips.
+    noise cancels. Of the middle lines, where they cross the lips. NaN where nothing is to be seen.
     """
     light = LOG[colours[:, 2:-2, np.abs(SAMPLES) <= FINE_REACH_MM]].mean(-1)
     apart = {k: float(((light[..., k:] - light[..., :-k]) ** 2).mean()) for k in (1, 2, 4, 8)}
-    return (apart[2] - apart[1]) / max(apart[8] - apart[4], 1e-9)
+    coarse = apart[8] - apart[4]
+    return (apart[2] - apart[1]) / coarse if coarse > FLAT else np.nan

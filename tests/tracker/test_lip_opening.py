@@ -148,3 +148,7 @@ def test_soft_pictures_are_told_from_sharp_ones_whatever_their_noise(
     grain = noise * np.random.default_rng(2).normal(size=sharp.shape)
     fine = [fineness(np.clip(picture + grain, 0, 255).astype(np.uint8)) for picture in (sharp, soft)]
     assert fine[1] < 0.13 < 0.3 < fine[0]
+
+
+def test_a_black_picture_is_neither_soft_nor_sharp(openings: tuple[np.ndarray, np.ndarray]):
+    assert np.isnan(fineness(np.zeros_like(painted(openings[0]))))
