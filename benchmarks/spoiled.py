@@ -200,15 +200,18 @@ def spoil(video: Path, folder: Path) -> None:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         lines = done.stderr.splitlines()
         if done.returncode:
-            print(f"{name:24s}refused: {lines[-1].removeprefix(f'personalize: {film}: ')[:90]}", flush=True)
+            said = lines[-1] if lines else f"exit code {done.returncode}"
+            print(f"{name:24s}refused: {said.removeprefix(f'personalize: {film}: ')[:90]}", flush=True)
+            if name == WHOLE:  # there is nothing to compare with
+                return
             continue
         if name == WHOLE:
             points = read_landmarks(run / "landmarks/landmarks.npz").points[..., :2]
         used, out, covered, rmse, bias, r = opening_errors(
             run, whole, way if isinstance(way, Cover) else None
         )
-        said = [line.removeprefix("warning: ") for line in lines if line.startswith("warning: ")]
-        warned = "; ".join(text[:WARNED] for text in said if "of usable face" not in text)
+        warnings = [line.removeprefix("warning: ") for line in lines if line.startswith("warning: ")]
+        warned = "; ".join(text[:WARNED] for text in warnings if "of usable face" not in text)
         print(
             f"{name:24s}{used:6.1f}{out:10.1f}{covered:14.1f}{rmse:7.2f}{bias:7.2f}{r:7.3f}  {warned}",
             flush=True,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import signal
 import sys
@@ -37,13 +38,15 @@ COMMANDS: dict[str, Callable[..., None]] = {
 }
 INPUT_ERROR, BUG, INTERRUPTED = 2, 1, 130
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's share of it, the largest file
+# A place that the user named and that cannot be read or written.
+CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     help="Turn a talking-head video into a personal, editable 3D facial animation model.",
     epilog="""Examples:  personalize talk.mp4   |   personalize animate speech.wav --subject talk.personalize   |
-    personalize edit talk.animation/motion.npz --audio speech.wav --keep :1.5,8.2: --subject talk.personalize   |
+    personalize edit speech.animation/motion.npz --audio speech.wav --keep :1.5,8.2: --subject talk.personalize   |
     personalize demo.   A video whose name is a command's is given as ./name.""",
 )
 for name, command in COMMANDS.items():
@@ -90,6 +93,8 @@ def _interruptions() -> list[int]:
 def main() -> None:
     """Entry point. Exit codes: 0 done, 2 the user's input, 130 interrupted, 1 a bug."""
     arguments = with_default_command(sys.argv[1:]) or ["--help"]
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # names of files that are no text are printed as they are
     interruptions = _interruptions()
     try:
         code = app(arguments, standalone_mode=False)
@@ -105,6 +110,12 @@ def main() -> None:
         elif isinstance(error, OSError) and error.errno in FULL:
             typer.echo(
                 "personalize: no space is left to write the results; free some and run the same command again",
+                err=True,
+            )
+            code = INPUT_ERROR
+        elif isinstance(error, OSError) and error.errno in CLOSED and error.filename:
+            typer.echo(
+                f"personalize: {error.filename}: cannot be read or written ({error.strerror}); choose another place (--out)",
                 err=True,
             )
             code = INPUT_ERROR

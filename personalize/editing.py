@@ -161,7 +161,13 @@ def _sound_offset(path: Path, motion: Motion) -> float:
     """How late the sound is, s, where the motion is of a run whose sound did not fit its pictures, or made from one."""
     registration = path.with_name("registration.json")
     if motion.provenance.get("synthetic") is False and registration.is_file():
-        return float(json.loads(registration.read_text(encoding="utf-8"))["av_offset_s"])
+        try:
+            return float(json.loads(registration.read_text(encoding="utf-8"))["av_offset_s"])
+        except (OSError, ValueError, KeyError, TypeError):
+            raise UserError(
+                f"{registration}: does not say how late the sound is; make the run's registration again, or give the "
+                "motion from another folder"
+            ) from None
     return float(motion.provenance.get("av_offset_s", 0.0))
 
 

@@ -24,8 +24,8 @@ def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """UTF-8 text, atomically."""
-    write_atomic(path, lambda stream: stream.write(text.encode()))
+    """UTF-8 text, atomically; bytes of file names that are no text are written as \\xNN."""
+    write_atomic(path, lambda stream: stream.write(text.encode(errors="backslashreplace")))
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -99,5 +99,6 @@ class Reporter:
 
     def _write_log(self, text: str) -> None:
         if self._log is not None:
-            with self._log.open("a", encoding="utf-8") as stream:
+            # The name of a video may hold bytes that are no text.
+            with self._log.open("a", encoding="utf-8", errors="backslashreplace") as stream:
                 stream.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")

@@ -223,7 +223,9 @@ def _motion_sequence(
 
 
 def _work_folder(out: Path) -> Path:
-    """`<out>.work`, made; UserError where it cannot be."""
+    """`<out>.work`, made; UserError where it cannot be, or `out` is a folder."""
+    if out.is_dir():
+        raise UserError(f"{out}: a folder; give --out the name of a file, as {out / 'model.safetensors'}")
     work = out.with_name(f"{out.name}.work")
     try:
         work.mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,7 @@ class VideoWriter:
         self._partial = path.with_name(f".{path.name}.partial")
         self._fps = fps
         self._size = size
-        self._count = 0
+        self._count, self._last = 0, -1
         self._container = av.open(str(self._partial), "w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(fps).limit_denominator(1001)
         options = _X264 | {"crf": str(crf), "preset": preset}
@@ -72,7 +72,9 @@ class VideoWriter:
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24").reformat(
             format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
         )
-        frame.pts, frame.time_base = round(time / _TIME_BASE), _TIME_BASE
+        # Of two pictures nearer than the clock tells apart the later one comes a tick behind.
+        self._last = max(round(time / _TIME_BASE), self._last + 1)
+        frame.pts, frame.time_base = self._last, _TIME_BASE
         self._container.mux(self._video.encode(frame))
 
     def _write_audio(self, until_s: float) -> None:

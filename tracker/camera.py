@@ -31,7 +31,9 @@ FILM_MM = 36.0
 MIDDLE, MIDDLE_SD_LOG = 1.1, 0.12
 FOCAL_RANGE = (0.6, 5.0)  # of the long side
 LEAST_SD_LOG = 0.08  # of log(focal): what light and skin that moves do to all tracks alike
-TOLD = 0.8  # of the prior's uncertainty: a clip that leaves more of it has told nothing
+# Of PRIOR_SD_LOG: a clip that leaves more of it has told nothing. Beside a lens that was written down it always has its
+# say.
+TOLD = 0.8
 MIN_TURN_DEG = 8.0  # a head that turns less leaves focal length and depth undecided
 # Of the distance between the outer eye corners: farther landmarks, and points that were followed, do not count for a
 # frame's pose.

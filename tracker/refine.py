@@ -16,7 +16,7 @@ from tracker.lip_lines import LipLines, fineness
 from tracker.lip_motion import steadied
 from tracker.lip_opening import lip_edges
 from tracker.rigid_pose import hold_poses, turned_as_far
-from tracker.skin_fit import Photometry, Subject, fit_landmarks, fit_stretch, learn_levels
+from tracker.skin_fit import Level, Photometry, Subject, fit_landmarks, fit_stretch, learn_levels
 from tracker.skin_identity import fit_identity_to_skin, nearer_to_skin
 from tracker.threads import side_by_side
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
@@ -105,31 +105,45 @@ def refine_track(
         x = fit_landmarks(subject, x, smoothness)
         x = hold_poses(x, bundle, good, run, time, sound) if rigid else x
     levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
-    deviation = np.full((len(good), 2), np.nan)
-    refined = x.copy()
-
-    def fitted(stretch: tuple[int, dict[int, U8]]) -> tuple[int, Index, F64, F64, F64]:
-        start, part = stretch
-        rows = np.array(list(part))
-        smoothness = smoothness_between(
-            subject.energy, landmarks.time, good[rows], segment, subject.smoothness
-        )
-        return start, rows, *fit_stretch(subject, levels, list(part.values()), rows, x[rows], smoothness)
-
-    for start, rows, found, before, after in side_by_side(
-        fitted, _stretches(cuts, len(good), _overlap(time))
-    ):
-        better = np.isfinite(found).all(1) & (after[:, 0] < before[:, 0])
-        own = (rows >= start) & (rows < start + STRETCH)
-        refined[rows[own & better]] = found[own & better]
-        deviation[rows[own]] = np.where(better[:, None], after, before)[own]
-        if progress:
-            progress(min(start + STRETCH, len(good)), len(good))
+    refined, deviation = _fitted_to_skin(subject, levels, cuts, x, good, segment, landmarks.time, progress)
     if rigid:
         refined = hold_poses(refined, bundle, good, run, time, sound, HALFWAY)
     out = make_track(landmarks, camera, head, subject.energy, opened, identity, refined, good)
     fine = fineness(np.stack([colours[row] for row in rows]))
     return Refined(out, _relative(deviation, good, len(track.time)), like_lips, fine)
+
+
+def _fitted_to_skin(
+    subject: Subject,
+    levels: list[Level],
+    cuts: Iterable[tuple[int, U8]],
+    x: F64,
+    good: Index,
+    segment: NDArray[np.int32],
+    time: F64,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[F64, F64]:
+    """x [n, U] by grey levels where they bring the skin nearer to what it should look like; deviation [n, 2].
+
+    cuts: cut-out faces by rows, in order. good: [n], the rows' frames. segment, time: see `_read_widths`.
+    """
+    refined, deviation = x.copy(), np.full((len(x), 2), np.nan)
+
+    def fitted(stretch: tuple[int, dict[int, U8]]) -> tuple[int, Index, F64, F64, F64]:
+        start, part = stretch
+        rows = np.array(list(part))
+        smoothness = smoothness_between(subject.energy, time, good[rows], segment, subject.smoothness)
+        return start, rows, *fit_stretch(subject, levels, list(part.values()), rows, x[rows], smoothness)
+
+    stretches = _stretches(cuts, len(x), _overlap(time[good]))
+    for start, rows, found, before, after in side_by_side(fitted, stretches):
+        better = np.isfinite(found).all(1) & (after[:, 0] < before[:, 0])
+        own = (rows >= start) & (rows < start + STRETCH)
+        refined[rows[own & better]] = found[own & better]
+        deviation[rows[own]] = np.where(better[:, None], after, before)[own]
+        if progress:
+            progress(min(start + STRETCH, len(x)), len(x))
+    return refined, deviation
 
 
 def _read_widths(

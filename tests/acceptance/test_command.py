@@ -130,10 +130,12 @@ def test_an_interruption_that_a_module_makes_another_error_of_is_one(
     ("error", "code", "said"),
     [
         (OSError(errno.ENOSPC, "No space left on device"), 2, "no space is left"),
+        (PermissionError(errno.EACCES, "Permission denied", "out/run.json"), 2, "out/run.json: cannot be"),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "talk.personalize"), 2, "File name too long"),
         (OSError(errno.EIO, "Input/output error"), 1, "this is a bug"),
     ],
 )
-def test_a_full_disk_is_no_bug(
+def test_a_full_disk_and_a_closed_place_are_no_bugs(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: OSError, code: int, said: str
 ) -> None:
     monkeypatch.setattr(cli.main, "app", Mock(side_effect=error))

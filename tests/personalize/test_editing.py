@@ -131,6 +131,10 @@ def test_the_sound_of_a_run_lies_where_registration_put_it(
     run(once, speech, tmp_path / "twice", keep=":0.7")
     run(motion, speech, tmp_path / "plain", keep=":0.7")
     assert [round(at[0], 4) for at in heard] == [0.58, 0.58, 0.5]
+    for broken in ("{}", "[]", "no JSON", '{"av_offset_s": null}'):
+        (tmp_path / "registration.json").write_text(broken)
+        with pytest.raises(UserError, match="does not say how late the sound is"):
+            run(tmp_path / "motion.npz", speech, tmp_path / "once", keep=":0.7")
 
 
 def test_mistakes_get_one_line_and_write_nothing(

@@ -419,6 +419,24 @@ def test_how_much_of_a_face_is_cut_off_is_measured() -> None:
     assert follower.tracklets[0].sightings[0].burnt == pytest.approx(1 / 3, abs=0.02)
 
 
+def test_small_faces_that_are_found_near_each_other_are_followed_once_each() -> None:
+    boxes = np.float32([[100, 100, 130, 130], [140, 100, 170, 130]])
+    down, right = np.mgrid[:256, :256].astype(np.uint8)
+    picture = np.stack([right, down, down], axis=-1)  # each pixel says where it is
+
+    def detect(rgb: np.ndarray, tiled: bool = False) -> list[Face]:
+        """Both faces, but in the whole picture only where tiles are searched."""
+        if rgb.shape == picture.shape and not tiled:
+            return []
+        corner = np.tile(rgb[0, 0, :2].astype(np.float32), 2)
+        return [Face(box - corner, np.zeros((6, 2), np.float32), 0.9) for box in boxes]
+
+    follower = FaceFollower(Mock(detect=detect, landmarks=lambda *_: (np.zeros((478, 3)), 0.0, None)))
+    for index in range(12):
+        follower.add(index, index / 25, picture)
+    assert [len(tracklet.frames) for tracklet in follower.tracklets] == [12, 12]
+
+
 def test_behind_a_cut_a_face_is_looked_at_anew_however_shortly_it_is_seen() -> None:
     face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
     points = np.random.default_rng(0).normal(200, 40, (478, 3)).astype(np.float32)

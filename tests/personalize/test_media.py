@@ -385,3 +385,11 @@ def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
         writer.write(corner_picture())
         raise RuntimeError
     assert path.read_bytes() == b"earlier" and list(tmp_path.iterdir()) == [path]
+
+
+def test_pictures_nearer_than_the_clock_tells_apart_are_written_all_the_same(tmp_path: Path) -> None:
+    times = (0.0, 0.04, 0.040002, 0.08)
+    with VideoWriter(tmp_path / "out.mp4", 25, (96, 64)) as writer:
+        for time in times:
+            writer.write(corner_picture(), time)
+    assert [t for t, _ in read_frames(tmp_path / "out.mp4")] == pytest.approx(times, abs=1e-4)

@@ -1,12 +1,14 @@
 """Time left in plain lines: of a stage from its start, of what it continues, and of a second count in it."""
 
 import io
+import os
 from pathlib import Path
 
 import pytest
 
 from personalize import reporter
 from personalize.errors import UserError
+from personalize.files import write_text
 from personalize.reporter import Reporter
 
 
@@ -59,3 +61,13 @@ def test_the_log_says_why_a_stage_stopped(tmp_path: Path) -> None:
         with pytest.raises(type(error)), reporter.stage("ingest"):
             raise error
         assert (tmp_path / "log.txt").read_text().splitlines()[-1].endswith(f"ingest stopped: {said}")
+
+
+def test_names_that_are_no_text_are_written_all_the_same(tmp_path: Path) -> None:
+    name = os.fsdecode(b"caf\xe9.mp4")
+    reporter = Reporter(io.StringIO())
+    reporter.log_to(tmp_path / "log.txt")
+    reporter.say(name)
+    write_text(tmp_path / "report.html", name)
+    for file in tmp_path.iterdir():
+        assert "caf" in file.read_text(encoding="utf-8")

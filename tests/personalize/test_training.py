@@ -178,6 +178,8 @@ def test_wrong_subjects_and_meshes_get_one_line(fake: FakeVocaset, tmp_path: Pat
         train(out, folder, mesh, adapt=[TEST[1]])
     with pytest.raises(UserError, match="give a mesh of the data's topology"):
         train(out, folder, FakeVocaset({}, FLAME).write_mesh(tmp_path / "flame.ply"))
+    with pytest.raises(UserError, match="a folder; give --out the name of a file"):
+        train(tmp_path, folder, mesh)
     (tmp_path / "broken.ply").write_text("ply\nelement vertex many\n")
     with pytest.raises(UserError, match="not a readable mesh"):
         train(out, folder, tmp_path / "broken.ply")

@@ -141,6 +141,14 @@ def test_a_dark_mouth_lowers_the_openings_error(dark_mouth: Film):
     assert error < 0.7 * opening_error_mm(dark_mouth.track, dark_mouth.gap)
 
 
+def test_how_fine_the_light_is_is_told_by_the_whole_clip(dark_mouth: Film, monkeypatch: pytest.MonkeyPatch):
+    soft = [cv2.GaussianBlur(picture, (0, 0), 3.0) for picture in dark_mouth.pictures[:-6]]
+    pictures = [*soft, *dark_mouth.pictures[-6:]]
+    at_once = dark_mouth.refine(pictures).fineness
+    monkeypatch.setattr(refine, "STRETCH", 8)
+    assert dark_mouth.refine(pictures).fineness == at_once < 0.8 * dark_mouth.refine().fineness
+
+
 @pytest.mark.xfail(
     reason="a lit tongue of the lips' colour tells nothing, and landmarks err by a quarter pixel", strict=True
 )
