@@ -1,12 +1,12 @@
 """How a clip is tracked when its film is spoiled, and whether that is told: `python -m benchmarks spoiled VIDEO ...`.
 
 The first seconds of a video are written anew as they are, and spoiled: compressed, in other light, with noise, out of
-focus, without colours, and with things pasted over the mouth. Each goes through the command up to `judge`.
+focus, without colours, shaken, and with things pasted over the mouth. Each goes through the command up to `judge`.
 
 used            frames that are used by default, %
-bare out        of those that nothing covers, which are left out; %
-covered used    of those in which the mouth is covered all the way, which are used; %
-rmse, bias, r   lip opening of the used frames without a cover against the copy that is not spoiled, mm
+bare out        of those that nothing covers or shakes, which are left out; %
+covered used    of those in which the mouth is covered all the way, or which are shaken as far, which are used; %
+rmse, bias, r   lip opening of the other used frames against the copy that is not spoiled, mm
 warnings        how each begins
 """
 
@@ -16,6 +16,7 @@ import argparse
 import subprocess
 import sys
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,23 +46,46 @@ BELOW = 1.3  # of the distance between the eyes: how far under the mouth a cover
 
 
 @dataclass(frozen=True)
-class Cover:
-    """Something that comes over the mouth from below at the `times`, s, within `ramp` s, and stays for `hold` s.
-
-    skin: as the forehead, or a dark ball. wide: of the distance between the eyes. aside: of that, to the left.
-    """
+class Spell(ABC):
+    """Something that comes at the `times`, s, within `ramp` s, and stays for `hold` s."""
 
     times: tuple[float, ...]
     ramp: float
     hold: float
+
+    def near(self, time: float) -> float:
+        """0..1, 1 where it is there altogether."""
+        inside = (min(time - t, t + 2 * self.ramp + self.hold - time) / self.ramp for t in self.times)
+        return float(np.clip(max(inside), 0, 1))
+
+    @abstractmethod
+    def over(self, rgb: U8, points: F32, near: float) -> U8:
+        """The picture [H, W, 3] with it; points: landmarks [478, 2] px."""
+
+
+@dataclass(frozen=True)
+class Shaken(Spell):
+    """The camera moves aside while the shutter is open, by `far` of the distance between the eyes."""
+
+    far: float = 0.3
+
+    def over(self, rgb: U8, points: F32, near: float) -> U8:
+        """The picture smeared."""
+        eyes = float(np.linalg.norm(points[LEFT_EYE_OUTER] - points[RIGHT_EYE_OUTER]))
+        length = round(near * self.far * eyes) if np.isfinite(eyes) else 0
+        return rgb if length < 2 else np.asarray(cv2.blur(rgb, (length, 1)), np.uint8)
+
+
+@dataclass(frozen=True)
+class Cover(Spell):
+    """Something that comes over the mouth from below.
+
+    skin: as the forehead, or a dark ball. wide: of the distance between the eyes. aside: of that, to the left.
+    """
+
     skin: bool = True
     wide: float = 1.0
     aside: float = 0.0
-
-    def near(self, time: float) -> float:
-        """0..1, 1 where it covers the mouth."""
-        inside = (min(time - t, t + 2 * self.ramp + self.hold - time) / self.ramp for t in self.times)
-        return float(np.clip(max(inside), 0, 1))
 
     def over(self, rgb: U8, points: F32, near: float) -> U8:
         """The picture with it."""
@@ -129,7 +153,7 @@ def grey(rgb: U8, _: F32) -> U8:
 
 # Name -> what is done to each picture, x264's crf.
 WHOLE = "as it is"
-SPOILED: dict[str, tuple[Picture | Cover, int]] = {
+SPOILED: dict[str, tuple[Picture | Spell, int]] = {
     WHOLE: (as_it_is, 12),
     "crf 30": (as_it_is, 30),
     "crf 36": (as_it_is, 36),
@@ -140,11 +164,12 @@ SPOILED: dict[str, tuple[Picture | Cover, int]] = {
     "no colours": (grey, 18),
     "a hand, four times": (Cover((1.5, 4.5, 7.5, 10.0), 0.3, 0.7), 18),
     "half a hand, slowly": (Cover((3.0,), 2.0, 2.0, wide=0.55, aside=0.28), 18),
+    "shaken, four times": (Shaken((1.5, 4.5, 7.5, 10.0), 0.1, 0.3), 18),
     "a ball, for 5.5 s": (Cover((1.0,), 0.5, 5.5, skin=False, wide=0.56, aside=-0.1), 18),
 }
 
 
-def write_spoiled(video: Path, out: Path, way: Picture | Cover, crf: int, points: F32) -> None:
+def write_spoiled(video: Path, out: Path, way: Picture | Spell, crf: int, points: F32) -> None:
     """The first SECONDS of a video, spoiled. points: [T, 478, 2] px, its landmarks; fewer count as none."""
     info = probe(video)
     sound = on_video_clock(*read_audio(video), SECONDS)
@@ -154,15 +179,15 @@ def write_spoiled(video: Path, out: Path, way: Picture | Cover, crf: int, points
             if time >= SECONDS:
                 break
             marks = points[frame] if frame < len(points) else none
-            changed = way.over(rgb, marks, way.near(time)) if isinstance(way, Cover) else way(rgb, marks)
+            changed = way.over(rgb, marks, way.near(time)) if isinstance(way, Spell) else way(rgb, marks)
             writer.write(changed, time)
 
 
-def opening_errors(run: Path, whole: Path, cover: Cover | None) -> list[float]:
+def opening_errors(run: Path, whole: Path, spell: Spell | None) -> list[float]:
     """[6]: used, bare out, covered used, %; RMSE, bias, mm, and r of the openings against the run `whole`."""
     track, right = (read_track(folder / "refine/track.npz") for folder in (run, whole))
     used = read_reasons(run / "refine/quality.csv") == "ok"
-    near = np.array([cover.near(time) if cover else 0.0 for time in track.time])
+    near = np.array([spell.near(time) if spell else 0.0 for time in track.time])
     bare, covered = near == 0, near == 1
     known = used & bare & np.isin(np.round(track.time, 3), np.round(right.time[right.valid], 3))
     found, true = track.lip_gap_mm[known], np.interp(track.time[known], right.time, right.lip_gap_mm)
@@ -208,7 +233,7 @@ def spoil(video: Path, folder: Path) -> None:
         if name == WHOLE:
             points = read_landmarks(run / "landmarks/landmarks.npz").points[..., :2]
         used, out, covered, rmse, bias, r = opening_errors(
-            run, whole, way if isinstance(way, Cover) else None
+            run, whole, way if isinstance(way, Spell) else None
         )
         warnings = [line.removeprefix("warning: ") for line in lines if line.startswith("warning: ")]
         warned = "; ".join(text[:WARNED] for text in warnings if "of usable face" not in text)

@@ -94,7 +94,9 @@ def main() -> None:
     """Entry point. Exit codes: 0 done, 2 the user's input, 130 interrupted, 1 a bug."""
     arguments = with_default_command(sys.argv[1:]) or ["--help"]
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="surrogateescape")  # names of files that are no text are printed as they are
+        sys.stdout.reconfigure(
+            errors="surrogateescape"
+        )  # names of files that are no text are printed as they are
     interruptions = _interruptions()
     try:
         code = app(arguments, standalone_mode=False)
@@ -115,7 +117,8 @@ def main() -> None:
             code = INPUT_ERROR
         elif isinstance(error, OSError) and error.errno in CLOSED and error.filename:
             typer.echo(
-                f"personalize: {error.filename}: cannot be read or written ({error.strerror}); choose another place (--out)",
+                f"personalize: {error.filename}: cannot be read or written ({error.strerror}); choose another place "
+                "(--out)",
                 err=True,
             )
             code = INPUT_ERROR

@@ -44,8 +44,8 @@ class Camera:
     """Pinhole camera of one clip. `focal_sd_log` is the standard deviation of log(focal).
 
     distortion: radial coefficients (k1, k2, …) of OpenCV's model, empty for none.
-    method: `bundle` when the clip's own motion decided, or had its say beside a lens that the camera wrote down; `prior`
-    when the stated prior did; `given` by the user.
+    method: `bundle` when the clip's own motion decided, or had its say beside a lens that the camera wrote down;
+    `prior` when the stated prior did; `given` by the user.
     prior: the sentence that states the prior used.
     """
 

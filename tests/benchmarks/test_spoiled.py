@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.spoiled import SPOILED, Cover, blurred, lit, noisy, opening_errors, write_spoiled
+from benchmarks.spoiled import SPOILED, Cover, Shaken, blurred, lit, noisy, opening_errors, write_spoiled
 from personalize.pictures import read_frames
 from personalize.run import write_track
 from tests.personalize.test_registration import track_of
@@ -40,6 +40,16 @@ def test_a_cover_lies_on_the_mouth_when_it_is_there_and_below_before(points: np.
     assert not (cover.over(rgb, points, 0.1) != rgb).any(2)[:150].any(), "an eye's distance farther down"
     assert cover.over(rgb, points, 0.0) is rgb
     assert cover.over(rgb, np.full_like(points, np.nan), 1.0) is rgb
+
+
+def test_a_shaken_picture_is_smeared_along_its_rows(points: np.ndarray) -> None:
+    edge = np.zeros((80, 80, 3), np.uint8)
+    edge[:, 40:] = 200
+    shaken = Shaken((0.0,), 0.1, 0.3, far=0.25)
+    row = shaken.over(edge, points, 1.0)[40, :, 0]
+    assert np.count_nonzero((row > 0) & (row < 200)) == pytest.approx(0.25 * EYES_PX, abs=1)
+    np.testing.assert_array_equal(shaken.over(edge.transpose(1, 0, 2), points, 1.0), edge.transpose(1, 0, 2))
+    assert shaken.over(edge, points, 0.0) is edge
 
 
 def test_light_noise_and_focus(points: np.ndarray) -> None:
