@@ -17,12 +17,10 @@ from scipy.spatial.transform import Rotation
 from benchmarks.ground_truth import GroundTruth
 from benchmarks.track_errors import rotation_error
 from personalize.container import probe
+from personalize.face_reading import read_face
 from personalize.ingest import find_usable
-from personalize.pictures import read_frames
 from tracker.camera import estimate_camera
-from tracker.feature_tracks import FeatureFollower
 from tracker.head import HeadModel, load_head
-from tracker.landmarker import track_landmarks
 from tracker.track import Bundle, Camera
 
 
@@ -30,11 +28,9 @@ def measure(path: Path, head: HeadModel) -> tuple[Camera, Bundle, float]:
     """Camera and bundle of one video, and the seconds that the camera stage took."""
     info = probe(path)
     frames, _ = find_usable(info)
-    cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
-    follower = FeatureFollower(frames.time, frames.usable, frames.segment, frames.box)
-    landmarks = track_landmarks(read_frames(path), len(frames.time), cuts, frames.box, watchers=(follower,))
+    landmarks, _, features = read_face(path, frames)
     start = time.perf_counter()
-    camera, bundle = estimate_camera(landmarks, follower.tracks(), head, recorded_mm=info.focal_mm)
+    camera, bundle = estimate_camera(landmarks, features, head, recorded_mm=info.focal_mm)
     return camera, bundle, time.perf_counter() - start
 
 

@@ -49,15 +49,14 @@ from benchmarks.strangers import number_of, strangers
 from benchmarks.track_bars import Row, print_bars
 from benchmarks.track_errors import compare
 from personalize.container import probe
+from personalize.face_reading import read_face
 from personalize.ingest import find_usable
 from personalize.pictures import read_frames
 from tracker.camera import FILM_MM, MIDDLE, MIDDLE_SD_LOG, estimate_camera
 from tracker.confidence import bare, judge
-from tracker.feature_tracks import FeatureFollower
 from tracker.fit import fit_track
 from tracker.head import HeadModel, load_head
-from tracker.landmarker import track_landmarks
-from tracker.occlusion import Appearance, FaceWatch
+from tracker.occlusion import Appearance
 from tracker.refine import refine_track
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
 
@@ -148,13 +147,9 @@ def watched(video: Path, head: HeadModel, recorded_mm: float = 0.0) -> Clip:
     start = clock()
     info = probe(video)
     frames, _ = find_usable(info)
-    cuts = set((np.flatnonzero(np.diff(frames.segment)) + 1).tolist())
-    watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment, frames.box)
-    watchers = (watch, follower)
-    landmarks = track_landmarks(read_frames(video), len(frames.time), cuts, frames.box, watchers=watchers)
-    appearance = watch.appearance(frames.usable)
+    landmarks, appearance, features = read_face(video, frames)
     recorded_mm = recorded_mm or info.focal_mm
-    camera, bundle = estimate_camera(landmarks, follower.tracks(), head, recorded_mm=recorded_mm)
+    camera, bundle = estimate_camera(landmarks, features, head, recorded_mm=recorded_mm)
     spent = (clock() - start) / len(frames.time)
     return Clip(landmarks, camera, bundle, frames.usable, frames.segment, appearance, video, spent)
 

@@ -13,6 +13,7 @@ from model.speech import load_encoder
 from personalize import run as files
 from personalize.evaluation.evaluate import evaluate_run
 from personalize.evaluation.report import write_report
+from personalize.face_reading import read_face
 from personalize.files import sha256_file, sha256_json, write_json
 from personalize.finetune import finetune_run
 from personalize.heads import head_assets, run_head
@@ -29,10 +30,7 @@ from personalize.subject_data import base_path
 from personalize.tracked import read_track_of
 from tracker.camera import estimate_camera
 from tracker.confidence import bare, judge
-from tracker.feature_tracks import FeatureFollower
 from tracker.fit import fit_track
-from tracker.landmarker import track_landmarks
-from tracker.occlusion import FaceWatch
 from tracker.refine import Refined, refine_track
 
 JUDGED = ("refine/track.npz", "refine/quality.csv")
@@ -52,7 +50,7 @@ def speech_model_assets(settings: Settings) -> dict[str, str]:
 class Ingest(Stage):
     """Video -> times, usable frames and why not, sound, split."""
 
-    name, version, needs = "ingest", 9, (VIDEO,)
+    name, version, needs = "ingest", 10, (VIDEO,)
     makes = ("media.json", "frames.npz", "audio.wav", "split.json")
 
     def make(self, context: Context, folder: Path) -> None:
@@ -80,18 +78,10 @@ class LandmarkStage(Stage):
 
     def make(self, context: Context, folder: Path) -> None:
         frames = files.read_frames(context.run.path / "ingest/frames.npz")
-        watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment, frames.box)
-        landmarks = track_landmarks(
-            read_frames(context.run.video),
-            len(frames.time),
-            cuts=set(np.flatnonzero(np.diff(frames.segment)) + 1),
-            boxes=frames.box,
-            progress=context.report.progress,
-            watchers=(watch, follower),
-        )
+        landmarks, appearance, features = read_face(context.run.video, frames, context.report.progress)
         files.write_landmarks(folder / "landmarks.npz", landmarks)
-        files.write_appearance(folder / "appearance.npz", watch.appearance(frames.usable))
-        files.write_features(folder / "features.npz", follower.tracks())
+        files.write_appearance(folder / "appearance.npz", appearance)
+        files.write_features(folder / "features.npz", features)
 
 
 class CameraStage(Stage):
@@ -150,7 +140,7 @@ class TrackStage(Stage):
 class Refine(Stage):
     """The track again, with the grey levels of the skin."""
 
-    name, folder, version = "refine", "photometric", 24
+    name, folder, version = "refine", "photometric", 25
     needs = (
         *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),
