@@ -242,14 +242,15 @@ def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
             turns.append(sureness_of_turns(landmarker, rgb, follower.widest))
         if progress is not None:
             progress(min(len(rows), expected), expected)
-    times, *views, damaged = zip(*rows)
+    times, whole_views, near_views, damaged = zip(*rows)
     # Once for the clip: two measures side by side would look like motion and rest.
     widths = np.zeros(len(times))
     for sighting in (sighting for face in follower.tracklets for sighting in face.sightings):
         widths[sighting.frame] = max(widths[sighting.frame], sighting.box[2] - sighting.box[0])
     side = min(SEARCH_SIDE, max(media.width, media.height))
     usual = float(np.median(widths[widths > 0])) / side if widths.any() else np.inf
-    of_cuts, of_repeats = views[usual < SMALL_FACE], views[usual < NEARLY_SMALL * SMALL_FACE]
+    of_cuts = near_views if usual < SMALL_FACE else whole_views
+    of_repeats = near_views if usual < NEARLY_SMALL * SMALL_FACE else whole_views
     at, differences = np.array(times), np.array([change for change, _ in of_cuts])
     again = repeated(at, *(np.array(column) for column in zip(*of_repeats)))
     return _Seen(at, differences, again, np.array(damaged), follower.tracklets, turns, reader)
