@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from personalize.files import read_npz, write_npz
+from model.files import write_npz
+from personalize.files import read_npz
 from tracker.track import F64
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +19,7 @@ from model.dataset import Standardization
 from model.denoiser import Architecture, Denoiser, NetworkConfig
 from model.diffusion import Diffusion, Parametrization, Schedule
 from model.errors import ModelError
+from model.files import write_bytes
 from model.motion import FPS, topology_hash
 
 SCHEMA = "1"
@@ -127,7 +127,7 @@ class Checkpoint:
         return replace(self, network=network, ema=ema, **changes)
 
     def save(self, path: Path) -> None:
-        """Write the file atomically (temporary name, fsync, rename)."""
+        """Write the file atomically."""
         arrays = {"basis": self.basis, "template": self.template, "faces": self.faces.astype(np.int32)}
         arrays |= {f"standardization.{name}": value for name, value in asdict(self.standardization).items()}
         arrays |= {f"regions.{name}": value.astype(np.int32) for name, value in self.regions.items()}
@@ -147,7 +147,7 @@ class Checkpoint:
             "schedule": self.schedule,
             "parametrization": self.parametrization,
         }
-        write_atomically(path, serialize(tensors, metadata))
+        write_bytes(path, serialize(tensors, metadata))
 
     @classmethod
     def load(cls, path: Path, *, topology: str | None = None, encoder: str | None = None) -> Checkpoint:
@@ -241,16 +241,6 @@ def serialize(tensors: State, metadata: dict[str, str]) -> bytes:
     header = json.dumps(json.loads(content[8:start]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)
     return len(header).to_bytes(8, "little") + header + content[start:]
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Whole or not at all: temporary name, fsync, rename."""
-    temporary = path.with_name(f".{path.name}.partial")
-    with temporary.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(path)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

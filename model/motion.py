@@ -6,7 +6,6 @@ import hashlib
 import json
 import lzma
 import math
-import os
 import tokenize
 import zipfile
 import zlib
@@ -16,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from model.files import write_npz
 
 FPS = 30.0
 # A file of displacements becomes basis form with this root mean square error over vertices and frames.
@@ -73,24 +74,19 @@ class Motion:
         return np.tensordot(self.coefficients, basis, axes=1)
 
     def save(self, path: Path) -> None:
-        """Write `motion.npz` atomically (temporary name, fsync, rename)."""
-        temporary = path.with_name(f".{path.name}.partial")
-        with temporary.open("wb") as stream:
-            np.savez_compressed(
-                stream,
-                fps=np.float64(self.fps),
-                start_s=np.float64(self.start_s),
-                template=self.template,
-                faces=self.faces,
-                basis=self.basis,
-                coefficients=self.coefficients,
-                valid=self.valid,
-                topology=np.str_(self.topology),
-                provenance=np.str_(json.dumps(self.provenance)),
-            )
-            stream.flush()
-            os.fsync(stream.fileno())
-        temporary.replace(path)
+        """Write `motion.npz` atomically."""
+        write_npz(
+            path,
+            fps=np.float64(self.fps),
+            start_s=np.float64(self.start_s),
+            template=self.template,
+            faces=self.faces,
+            basis=self.basis,
+            coefficients=self.coefficients,
+            valid=self.valid,
+            topology=np.str_(self.topology),
+            provenance=np.str_(json.dumps(self.provenance)),
+        )
 
     @classmethod
     def load(cls, path: Path) -> Motion:

@@ -18,10 +18,11 @@ from torch.nn.parallel import DistributedDataParallel
 
 from model.architectures import build_network
 from model.blinks import independent_blinks
-from model.checkpoint import Checkpoint, State, read_tensors, serialize, write_atomically
+from model.checkpoint import Checkpoint, State, read_tensors, serialize
 from model.dataset import Batch, Crops, Sequence
 from model.diffusion import Diffusion, Progress
 from model.errors import ModelError
+from model.files import write_bytes
 from model.objective import Draws, Gradient, Objective, coefficient_weights, gradient_of
 from model.training_config import TrainingConfig, available_device, settled
 from model.training_log import TrainingLog
@@ -198,7 +199,7 @@ class Trainer:
                 tensors[f"adam.{index}.{name}"] = value
         tensors["losses"] = torch.stack(self._losses) if self._losses else torch.zeros(0)
         metadata = {"step": str(self.step), "settings": self._settings()}
-        write_atomically(self.folder / STATE_FILE, serialize(tensors, metadata))
+        write_bytes(self.folder / STATE_FILE, serialize(tensors, metadata))
 
     def _restore(self) -> None:
         path = self.folder / STATE_FILE

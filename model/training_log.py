@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 from typing import Any, TextIO
 
-from model.checkpoint import write_atomically
+from model.files import write_bytes
 
 
 class TrainingLog:
@@ -23,7 +23,7 @@ class TrainingLog:
             with path.open(newline="") as stream:
                 rows = [row for row in csv.reader(stream) if len(row) == 2 and row[0].isdigit()]
         lines = ["step,loss", *(",".join(row) for row in rows if int(row[0]) <= step)]
-        write_atomically(path, ("\n".join(lines) + "\n").encode())
+        write_bytes(path, ("\n".join(lines) + "\n").encode())
         self._stream = path.open("a")
         if tensorboard is not None:
             from torch.utils.tensorboard import SummaryWriter

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from model.files import write_atomic
 from model.motion import DAMAGED
 from model.speech import SpeechEncoder
-from personalize.files import read_npz, write_atomic
+from personalize.files import read_npz
 
 LIMIT_BYTES = 1 << 30
 # Bumped when an encoder of the same name gives other features: it is part of every key.

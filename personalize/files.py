@@ -1,41 +1,26 @@
-"""Files that are either whole or not there: temporary name, fsync, rename; and content hashes."""
+"""Text and JSON that are either whole or not there; arrays read; content hashes."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-
-def write_atomic(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, flush it to disk, then rename it to `path`."""
-    temporary = path.with_name(f".{path.name}.partial")
-    with temporary.open("wb") as stream:
-        write(stream)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(path)
+from model.files import write_bytes
 
 
 def write_text(path: Path, text: str) -> None:
     """UTF-8 text, atomically; bytes of file names that are no text are written as \\xNN."""
-    write_atomic(path, lambda stream: stream.write(text.encode(errors="backslashreplace")))
+    write_bytes(path, text.encode(errors="backslashreplace"))
 
 
 def write_json(path: Path, value: Any) -> None:
     """Indented JSON, atomically; NaN and infinity are refused, since other programs cannot read them."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
-
-
-def write_npz(path: Path, **arrays: NDArray[Any]) -> None:
-    """Compressed `.npz`, atomically."""
-    write_atomic(path, lambda stream: np.savez_compressed(stream, **arrays))  # type: ignore[arg-type]
 
 
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:

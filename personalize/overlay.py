@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from model.files import write_bytes
 from personalize.errors import UserError
-from personalize.files import write_atomic
 from personalize.pictures import read_frames
 from personalize.render.track import TrackPictures, grid
 from personalize.run import RunFolder
@@ -62,7 +62,7 @@ def write_overlay(
             progress(frame + 1, total)
     sheet = cv2.cvtColor(grid([tiles[frame] for frame in notable], COLUMNS), cv2.COLOR_RGB2BGR)
     _, png = cv2.imencode(".png", sheet)
-    write_atomic(folder / "contact_sheet.png", lambda stream: stream.write(png.tobytes()))
+    write_bytes(folder / "contact_sheet.png", png.tobytes())
 
 
 def notable_frames(valid: NDArray[np.bool_], confidence: NDArray[np.float32]) -> NDArray[np.intp]:

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
+from model.files import write_npz
 from personalize.errors import UserError
-from personalize.files import read_npz, sha256_file, write_json, write_npz
+from personalize.files import read_npz, sha256_file, write_json
 from personalize.settings import Settings
 from personalize.shots import Frames
 from tracker.feature_tracks import FeatureTracks

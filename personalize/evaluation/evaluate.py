@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.checkpoint import Checkpoint
+from model.files import write_npz
 from model.metrics import lip_opening_mm, score
 from model.ridge import Ridge
 from model.speech import load_encoder
 from model.synthesis import synthesize
 from personalize.evaluation.clip import write_clip
-from personalize.files import write_json, write_npz
+from personalize.files import write_json
 from personalize.reporter import Reporter
 from personalize.run import RunFolder
 from personalize.settings import Settings

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from model.files import write_npz
 from personalize.render import mouth
 from personalize.sound import read_audio
 from personalize.talkers.motion import TalkerMotion, talker_motion
@@ -66,10 +67,7 @@ class Truth:
 
     def save(self, path: Path) -> None:
         """Write as npz, one key a field; whole or not at all."""
-        partial = path.with_name(f".{path.name}.partial")
-        with partial.open("wb") as stream:
-            np.savez_compressed(stream, **asdict(self))
-        partial.replace(path)
+        write_npz(path, **asdict(self))
 
     @classmethod
     def load(cls, path: Path) -> Truth:

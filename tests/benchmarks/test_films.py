@@ -22,7 +22,7 @@ SCENE = Scene("tiny", 5, seconds=0.2, head=0.5)
 ROOT = Path(__file__).parents[2]
 # What is imported and changes no film: where and how files lie, types, sound, heads of another kind.
 NO_MAKERS = {
-    *("personalize/feature_cache.py", "personalize/files.py", "personalize/sound.py"),
+    *("model/files.py", "personalize/feature_cache.py", "personalize/files.py", "personalize/sound.py"),
     *("tracker/skinning.py", "tracker/track.py"),
 }
 
