@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,23 +109,23 @@ def last_stages(rows: list[Row]) -> list[Row]:
     return list({row.clip: row for row in rows}.values())
 
 
-def print_bars(rows: list[Row], say: Callable[[str], None] = print) -> None:
+def print_bars(rows: list[Row]) -> None:
     """One line a limit: wanted, reached, and whether, also by group; then what each further stage changes."""
     last = last_stages(rows)
-    say(f"\n{'wanted, after the last stage, mean over clips (worst: *)':58s} {'limit':>8s} {'reached':>9s}")
+    print(f"\n{'wanted, after the last stage, mean over clips (worst: *)':58s} {'limit':>8s} {'reached':>9s}")
     for bar in BARS:
         value = bar.reached(last)
         if np.isfinite(value):
             sign, name = ">=" if bar.at_least else "<=", bar.name + (" *" if bar.worst else "")
-            say(
+            print(
                 f"{name:58s} {sign}{bar.limit:6.4g} {value:9.3f}  "
                 f"{bar.answer(value) + ':':4s} {bar.by_group(last)}"
             )
     for error in PHOTOMETRIC:
-        _print_gain(rows, error, say)
+        _print_gain(rows, error)
 
 
-def _print_gain(rows: list[Row], error: str, say: Callable[[str], None]) -> None:
+def _print_gain(rows: list[Row], error: str) -> None:
     """By how much the last stage lowers an error, and on which clips it raises it."""
     first = {row.clip: row for row in reversed(rows)}
     pairs = [(row, first[row.clip]) for row in last_stages(rows) if row.stage != first[row.clip].stage]
@@ -136,7 +135,7 @@ def _print_gain(rows: list[Row], error: str, say: Callable[[str], None]) -> None
         return
     gain = 1 - after.mean() / before.mean()
     raised = [pair[0].clip for pair, a, b in zip(pairs, after, before) if a > (1 + RAISED) * b]
-    say(
+    print(
         f"{f'{error} lowered by {pairs[0][0].stage}, %':58s} >={100 * GAIN:6.4g} {100 * gain:9.1f}  "
         f"{'yes' if gain >= GAIN and not raised else 'no'}"
         f"{'; raised on ' + ', '.join(raised) if raised else ''}"

@@ -65,12 +65,6 @@ class RigidScene:
         """[O] place of each observation's frame among the frames."""
         return np.searchsorted(self.frames, self.observations[:, 0].astype(int))
 
-    def residuals(self, focal: float, principal: tuple[float, float]) -> F64:
-        """[O, 2] px, projected minus observed."""
-        row, point = self.rows(), self.points[self.observations[:, 1].astype(int)]
-        seen = np.einsum("oij,oj->oi", self.rotation[row], point) + self.translation[row]
-        return focal * seen[:, :2] / seen[:, 2:] + principal - self.observations[:, 2:]
-
 
 def camera_model(focal: float, principal: tuple[float, float], size: tuple[int, int]) -> pycolmap.Camera:
     """pycolmap's pinhole camera; focal, principal and size (width, height) in px."""

@@ -48,7 +48,6 @@ def fit_track(
     usable: NDArray[np.bool_],
     segment: NDArray[np.int32],
     progress: Callable[[int, int], None] | None = None,
-    weights: Weights | None = None,
     evidence: F32 | None = None,
 ) -> Track:
     """The head's identity, and expression, pose and gaze in every frame, under the given camera.
@@ -59,7 +58,7 @@ def fit_track(
     half they tell nothing of the identity, and the frames around them tell the pose.
     Raises TrackError when no frame can be measured.
     """
-    weights = weights or Weights()
+    weights = Weights()
     model = landmark_model(head, weights)
     good = _measurable(landmarks, model, usable)
     observed = camera.lens.points(landmarks.points[good][..., :2])

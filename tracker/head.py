@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -177,27 +177,28 @@ def _combine(weights: F32, basis: F32) -> F32:
     return (weights @ basis.reshape(len(basis), -1)).reshape(*weights.shape[:-1], *basis.shape[1:])
 
 
-@lru_cache(maxsize=2)
-def load_head(path: Path | None = None) -> HeadModel:
-    """The embedded head, or the one at `path`, with its landmark embedding (`<stem>.landmarks.npz` beside it).
+@cache
+def load_head() -> HeadModel:
+    """The embedded head, with its landmark embedding.
 
     Raises TrackError when a file is missing or damaged, or when the embedding was made for another head.
     """
-    path = path or ASSET
-    head = read_head(path)
+    embedding = read_landmark_embedding(ASSET.with_suffix(".landmarks.npz"))
+    return replace(read_head(ASSET), landmark_embedding=embedding)
+
+
+def read_landmark_embedding(path: Path) -> LandmarkEmbedding:
+    """What tools/build_embedding.py wrote. Raises TrackError when the file is missing or damaged."""
     try:
-        with np.load(path.with_suffix(".landmarks.npz"), allow_pickle=False) as file:
-            embedding = LandmarkEmbedding(
+        with np.load(path, allow_pickle=False) as file:
+            return LandmarkEmbedding(
                 landmarks=file["landmarks"],
                 triangles=file["triangles"],
                 barycentric=file["barycentric"],
                 head_sha256=str(file["head_sha256"]),
             )
     except (OSError, ValueError, KeyError) as error:
-        raise TrackError(
-            f"{path.with_suffix('.landmarks.npz')}: not a landmark embedding ({error})"
-        ) from error
-    return replace(head, landmark_embedding=embedding)
+        raise TrackError(f"{path}: not a landmark embedding ({error})") from error
 
 
 def read_head(path: Path) -> HeadModel:

@@ -41,20 +41,18 @@ def project(points: NDArray[np.floating], focal: float, principal: ArrayLike) ->
     return focal * points[..., :2] / points[..., 2:] + np.asarray(principal, points.dtype)
 
 
-def rasterize(
-    vertices_px: NDArray[np.floating], faces: NDArray[np.int32], size: tuple[int, int], cull: bool = True
-) -> Raster:
-    """Find the nearest triangle in every pixel.
+def rasterize(vertices_px: NDArray[np.floating], faces: NDArray[np.int32], size: tuple[int, int]) -> Raster:
+    """Find the nearest triangle in every pixel, of those that face the camera.
 
     vertices_px: [D, 3], x and y in px, depth > 0 in m. faces: [F, 3] i32. size: (width, height) px.
-    cull: skip triangles that face away. Those with a corner behind the camera or not finite always are.
+    Triangles with a corner behind the camera or not finite are skipped.
     """
     width, height = size
     triangle = np.full((height, width), -1, np.int32)
     barycentric = np.zeros((height, width, 3), np.float32)
     inverse_depth = np.zeros((height, width), np.float32)
     vertices = np.ascontiguousarray(vertices_px, np.float32)
-    _fill(vertices, np.ascontiguousarray(faces, np.int32), cull, triangle, barycentric, inverse_depth)
+    _fill(vertices, np.ascontiguousarray(faces, np.int32), triangle, barycentric, inverse_depth)
     depth = np.full_like(inverse_depth, np.inf)
     np.divide(1, inverse_depth, out=depth, where=inverse_depth > 0)
     return Raster(triangle, barycentric, depth)
@@ -125,7 +123,7 @@ def render(
 
 
 @njit(cache=True, nogil=True)
-def _fill(vertices, faces, cull, triangle, barycentric, inverse_depth):  # type: ignore[no-untyped-def]
+def _fill(vertices, faces, triangle, barycentric, inverse_depth):  # type: ignore[no-untyped-def]
     height, width = triangle.shape
     for f in range(len(faces)):
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -136,7 +134,7 @@ def _fill(vertices, faces, cull, triangle, barycentric, inverse_depth):  # type:
             continue
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         # y runs down: what faces the camera has a negative area. The test also refuses what is not finite.
-        if not 0 < abs(area) < 1e12 or (cull and area > 0):
+        if not -1e12 < area < 0:
             continue
         left = max(0, int(np.ceil(max(min(ax, bx, cx), -1e6))))
         right = min(width - 1, int(np.floor(min(max(ax, bx, cx), 1e6))))

@@ -17,6 +17,7 @@ from tracker.track import F64, STEP_S
 
 ROUNDS = 4  # of fixing what passes a bound
 GIVE_UP = 1e6  # damping at which no step can help
+CONVERGED = 1e-4  # of the energy
 LEAST_STEP = 0.05  # of STEP_S: nearer frames are taken to be so far apart
 PART, SHARED = 4000, 100  # frames of a long clip that are solved at once, and how many more on both sides
 CHUNK = 32  # frames linearized at once: their Jacobian stays near the cache
@@ -127,9 +128,7 @@ class SharedEnergy(Protocol):
         """Gauss-Newton model of the unknowns [identity (Ki), x]."""
 
 
-def solve_subject(
-    energy: SharedEnergy, identity: F64, x: F64, steps: int = 20, tolerance: float = 1e-4
-) -> Solution:
+def solve_subject(energy: SharedEnergy, identity: F64, x: F64, steps: int = 20) -> Solution:
     """Identity and the n key frames together: Levenberg-Marquardt, per-frame blocks eliminated (Schur)."""
     prior = energy.weights.identity * len(x)
     bounds = _bounds(energy)
@@ -152,7 +151,7 @@ def solve_subject(
             break
         gain, value = value - trial_value, trial_value
         identity, x, damping, done = trial_identity, trial, max(damping / 5, 1e-6), done + 1
-        if gain < tolerance * value:
+        if gain < CONVERGED * value:
             break
     return Solution(identity, x, value, done)
 
@@ -270,7 +269,6 @@ def solve_frames(
     x: F64,
     smoothness: Smoothness,
     steps: int = 10,
-    tolerance: float = 1e-4,
     progress: Progress | None = None,
 ) -> F64:
     """All frames [n, P] of the subject `shape` [L, 3] together, smooth in time.
@@ -287,9 +285,7 @@ def solve_frames(
             if progress:
                 progress(number * total + done, len(starts) * total)
 
-        found = _solve_part(
-            energy.select(part), shape, x[part], smoothness.select(part), steps, tolerance, so_far
-        )
+        found = _solve_part(energy.select(part), shape, x[part], smoothness.select(part), steps, so_far)
         out[start : start + PART] = found[start - first :][:PART]
     return out
 
@@ -300,7 +296,6 @@ def _solve_part(
     x: F64,
     smoothness: Smoothness,
     steps: int,
-    tolerance: float,
     progress: Progress,
 ) -> F64:
     def total(x: F64) -> float:
@@ -324,7 +319,7 @@ def _solve_part(
         if not trial_value < value:
             break
         gain, value, x, damping = value - trial_value, trial_value, trial, max(damping / 5, 1e-6)
-        if gain < tolerance * value:
+        if gain < CONVERGED * value:
             break
     progress(steps, steps)
     return x

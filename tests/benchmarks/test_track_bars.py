@@ -66,9 +66,9 @@ def test_a_mean_does_not_hide_the_film_behind_lower_bounds() -> None:
     assert bar.by_group(clips[:2]) == "person 0.250 yes"
 
 
-def test_printed_answers() -> None:
-    lines: list[str] = []
-    print_bars(rows(), lines.append)
+def test_printed_answers(capsys: pytest.CaptureFixture[str]) -> None:
+    print_bars(rows())
+    lines = capsys.readouterr().out.splitlines()
     answer = {line.split(",")[0].split(" lowered")[0]: line for line in lines if line.strip()}
     assert answer["out of model: surface against the mean head's"].endswith(
         "  yes: own 50.000 yes, shared 50.000 yes"
@@ -78,7 +78,7 @@ def test_printed_answers() -> None:
     assert not any("still face" in line for line in lines)
 
 
-def test_a_clip_in_which_nothing_moves_raises_nothing() -> None:
+def test_a_clip_in_which_nothing_moves_raises_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     def row(clip: str, stage: str, rotation: float, moves: float) -> Row:
         errors = {"rotation_deg": rotation, "lip_motion_truth": moves, "turn_deg": 0.0, "focal_pct": 0.0}
         errors |= {
@@ -91,7 +91,7 @@ def test_a_clip_in_which_nothing_moves_raises_nothing() -> None:
 
     clips = [row("talks", "landmarks", 1.0, 1.5), row("talks", "refined", 0.5, 1.5)]
     still = [row("still", "landmarks", 0.01, 0.0), row("still", "refined", 0.02, 0.0)]
-    lines: list[str] = []
-    print_bars([*clips, *still], lines.append)
+    print_bars([*clips, *still])
+    lines = capsys.readouterr().out.splitlines()
     (gain,) = (line for line in lines if line.startswith("rotation_deg lowered"))
     assert " 50.0 " in gain and gain.endswith("yes")

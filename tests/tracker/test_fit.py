@@ -221,7 +221,7 @@ def test_pressed_and_rolled_lips_are_thin_and_shut_and_do_not_cross(shapes: dict
     assert thickness[silent].mean() < thickness[: silent.start].min() - 1.5e-3
 
 
-def test_a_mouth_that_opens_in_another_profile_is_followed():
+def test_a_mouth_that_opens_in_another_profile_is_followed(monkeypatch):
     talker = Talker(75, seed=3, noise=0.001)
     # A fifth wider beside the middle and narrower in it, as no shape of ARKit's opens.
     along = (np.arange(len(LIP_PAIRS)) + 1) / (len(LIP_PAIRS) + 1)
@@ -234,7 +234,9 @@ def test_a_mouth_that_opens_in_another_profile_is_followed():
     usable, shot = np.ones(75, bool), np.zeros(75, np.int32)
     errors = []
     for sd in (Weights().lip_shape_sd, 1e-3):
-        track = fit_track(landmarks, CAMERA, HEAD, usable, shot, weights=replace(Weights(), lip_shape_sd=sd))
+        weights = Weights(lip_shape_sd=sd)
+        monkeypatch.setattr("tracker.fit.Weights", lambda weights=weights: weights)
+        track = fit_track(landmarks, CAMERA, HEAD, usable, shot)
         errors.append(track.lip_gap_mm - 0.8 * talker.gap)
     followed, held = (np.sqrt(np.mean(error**2)) for error in errors)
     assert followed < 0.5 * held

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tracker.energy import LIP_PAIRS
-from tracker.head import ASSET, HeadModel, load_head, read_head
+from tracker.head import ASSET, HeadModel, load_head, read_head, read_landmark_embedding
 from tracker.modes import LIP_SHAPES
 from tracker.raster import rasterize
 from tracker.track import TrackError
@@ -253,9 +253,9 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
     path.write_bytes(b"not an archive")
     with pytest.raises(TrackError, match="not a head model"):
         read_head(path)
-    path.write_bytes(ASSET.read_bytes())
-    with pytest.raises(TrackError, match="not a landmark embedding"):
-        load_head(path)
+    for embedding in (path, tmp_path / "missing.landmarks.npz"):
+        with pytest.raises(TrackError, match="not a landmark embedding"):
+            read_landmark_embedding(embedding)
 
 
 def test_the_inner_lips_landmarks_lie_each_on_its_own_lip():
