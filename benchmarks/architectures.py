@@ -30,7 +30,7 @@ from model.synthesis import synthesize
 from model.trainer import Trainer
 from model.training_config import TrainingConfig
 from personalize.run import RunFolder
-from personalize.sound import read_audio
+from personalize.sound import SPEECH_RATE, read_audio
 from personalize.subject_data import BASE_CHECKPOINT, load_subject_data, speech_features
 from personalize.talkers.film import ASSETS
 from personalize.talkers.motion import talker_motion
@@ -55,7 +55,7 @@ def made_up(base: Checkpoint, seed: int) -> tuple[list[Sequence], list[Sequence]
     head = load_head()
     audio, start_s = read_audio(ASSETS / "demo_speech.flac")
     phones = load_phones(ASSETS / "demo_speech.json")
-    talker = talker_motion(phones, len(audio) / 16000, FPS, seed, Style.random(seed), audio)
+    talker = talker_motion(phones, len(audio) / SPEECH_RATE, FPS, seed, Style.random(seed), audio)
     shapes = np.tensordot(head.expression_basis, base.basis, axes=((1, 2), (1, 2)))
     motion = (talker.expression_for(head.expression_names) @ shapes).astype(np.float32)
     times = start_s + np.arange(len(motion)) / FPS

@@ -155,7 +155,9 @@ def user_encoder(source: str) -> TransformersEncoder:
     if family not in FAMILIES:
         raise ModelError(f"{folder}: a model of type {family!r}; give one of {', '.join(FAMILIES)}")
     if extractor.sampling_rate != SAMPLE_RATE:
-        raise ModelError(f"{folder}: a model for sound at {extractor.sampling_rate} Hz; 16000 Hz is needed")
+        raise ModelError(
+            f"{folder}: a model for sound at {extractor.sampling_rate} Hz; {SAMPLE_RATE} Hz is needed"
+        )
     layer = int(match["layer"] or layers)
     if not 1 <= layer <= layers:
         raise ModelError(f"{source}: there is no layer {layer}; this model has layers 1 to {layers}")

@@ -18,14 +18,13 @@ from personalize.files import sha256_file
 from personalize.render.face import FaceCamera
 from personalize.reporter import Reporter
 from personalize.run import tool_version
-from personalize.sound import on_video_clock, read_audio
+from personalize.sound import FILM_RATE, on_video_clock, read_audio
 from personalize.subject_data import speech_features
 from personalize.video_writer import VideoWriter
 
 F32 = NDArray[np.float32]
 
 FILM_SIZE = (720, 720)
-AUDIO_RATE = 48_000
 
 
 def animate_speech(
@@ -47,14 +46,14 @@ def animate_speech(
     """
     path, checkpoint, speech_encoder = load_subject(subject, encoder)
     sound, start_s = read_speech(speech)
-    frames = max(1, round((start_s + len(sound) / AUDIO_RATE) * FPS))
+    frames = max(1, round((start_s + len(sound) / FILM_RATE) * FPS))
     features = speech_features(speech, np.arange(frames) / FPS, speech_encoder)
     s = checkpoint.guidance if guidance is None else guidance
     with report.stage("synthesis"):
         motions = synthesize(
             checkpoint, features, guidance=s, samples=samples, seed=seed, progress=report.progress
         )
-    audio = on_video_clock(sound, start_s, frames / FPS, AUDIO_RATE)
+    audio = on_video_clock(sound, start_s, frames / FPS, FILM_RATE)
     folder = out or Path(f"{speech.stem}.animation")
     for index, coefficients in enumerate(motions):
         motion = Motion(
@@ -99,7 +98,7 @@ def load_subject(subject: Path, encoder: str | None) -> tuple[Path, Checkpoint, 
 
 def read_speech(speech: Path) -> tuple[F32, float]:
     """Sound [S] at 48 kHz and the time s of its first sample; UserError where there is nothing to hear."""
-    sound, start_s = read_audio(speech, AUDIO_RATE)
+    sound, start_s = read_audio(speech, FILM_RATE)
     if not np.any(np.abs(sound) > 1e-4):
         raise UserError(f"{speech}: there is no sound in it; give a recording of speech")
     return sound, start_s
@@ -131,7 +130,7 @@ def write_film(
 ) -> None:
     """The motion from the front, 30 fps, with its sound [S] at 48 kHz from the motion's first frame on, if any."""
     camera = FaceCamera(motion.template, motion.faces, face, FILM_SIZE)
-    with VideoWriter(path, motion.fps, FILM_SIZE, sound, AUDIO_RATE) as film:
+    with VideoWriter(path, motion.fps, FILM_SIZE, sound, FILM_RATE) as film:
         for frame in range(len(motion.valid)):
             displacement = np.tensordot(motion.coefficients[frame], motion.basis, axes=1)
             film.write(camera.picture(displacement))

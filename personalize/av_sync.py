@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
+from personalize.sound import SPEECH_RATE
+
 F64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-AUDIO_RATE = 16_000
 STEP_S = 0.01  # of the grid on which both curves are compared
 RATE = round(1 / STEP_S)
 MAX_LAG = 100  # grid steps
@@ -109,11 +110,11 @@ def _opening_curve(times: F64, opening: NDArray[np.floating], usable: Bool) -> t
 
 def _loudness(audio: F64, start_s: float, first_s: float, count: int) -> F64:
     """Syllables in the logarithm of the speech band's envelope, [count] on the grid from `first_s`; 0 without sound."""
-    block = round(AUDIO_RATE * STEP_S)
+    block = round(SPEECH_RATE * STEP_S)
     blocks = len(audio) // block
     if blocks < RATE * SHORTEST_STRETCH_S or not audio.any():
         return np.zeros(count)
-    band = sosfiltfilt(butter(2, SPEECH_HZ, "bandpass", fs=AUDIO_RATE, output="sos"), audio)
+    band = sosfiltfilt(butter(2, SPEECH_HZ, "bandpass", fs=SPEECH_RATE, output="sos"), audio)
     envelope = np.sqrt((band[: blocks * block].reshape(blocks, block) ** 2).mean(1))
     level = float(np.sqrt((envelope**2).mean()))
     if level < 1e-6:

@@ -14,7 +14,7 @@ from model.speech import SpeechEncoder
 from personalize.errors import UserError
 from personalize.protocol import Reference, Subject, speech_at
 from personalize.reporter import Reporter
-from personalize.sound import AUDIO_RATE
+from personalize.sound import SPEECH_RATE
 from personalize.vocaset import ADAPT_TRAIN, ADAPT_VAL, ALL, TEST, TRAIN, UNSHARED, VAL, Vocaset
 
 
@@ -55,7 +55,7 @@ class Corpus:
     def _sequence(self, name: str, sentence: int, style: int) -> Sequence:
         """One sentence at 30 fps, as long as both its motion and its sound."""
         displacements, audio = self.data.displacements(name, sentence), self.data.audio(name, sentence)
-        frames = min(len(displacements), int(len(audio) * FPS / AUDIO_RATE))
+        frames = min(len(displacements), int(len(audio) * FPS / SPEECH_RATE))
         coefficients = self.motion.coefficients(displacements[:frames])
         return Sequence(coefficients, speech_at(audio, frames, self.encoder), np.ones(frames, bool), style)
 

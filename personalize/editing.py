@@ -17,13 +17,13 @@ from model.editing import Kept, edit, seam_of, with_frames
 from model.errors import ModelError
 from model.motion import Motion, MotionError
 from model.speech import SpeechEncoder
-from personalize.animation import AUDIO_RATE, load_subject, read_speech, sample_folder, write_sample
+from personalize.animation import load_subject, read_speech, sample_folder, write_sample
 from personalize.errors import UserError
 from personalize.files import sha256_file
 from personalize.regions import kept_share
 from personalize.reporter import Reporter
 from personalize.run import tool_version
-from personalize.sound import on_video_clock
+from personalize.sound import FILM_RATE, on_video_clock
 from personalize.subject_data import speech_features
 from personalize.times import frames_at
 
@@ -175,14 +175,14 @@ def _sound_of(speech: Path, motion: Motion, offset_s: float, encoder: SpeechEnco
     """Sound [S] at 48 kHz from the motion's first frame on, and the speech features [N, W] of its frames."""
     sound, start_s = read_speech(speech)
     times = motion.start_s + offset_s + np.arange(len(motion.valid)) / motion.fps
-    end_s = start_s + len(sound) / AUDIO_RATE
+    end_s = start_s + len(sound) / FILM_RATE
     if end_s < times[-1] - SOUND_SLACK_S:
         raise UserError(
             f"{speech}: its sound ends at {end_s:.2f} s, the motion at {times[-1]:.2f} s; give the whole recording"
         )
     length_s = len(times) / motion.fps
     features = speech_features(speech, times, encoder)
-    return on_video_clock(sound, start_s - times[0], length_s, AUDIO_RATE), features
+    return on_video_clock(sound, start_s - times[0], length_s, FILM_RATE), features
 
 
 def _as_json(path: Path, kept: Kept, settings: EditSettings) -> dict[str, object]:

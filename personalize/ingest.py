@@ -33,7 +33,7 @@ from personalize.shots import (
     sudden,
     usable_seconds,
 )
-from personalize.sound import AUDIO_RATE, on_video_clock, read_audio
+from personalize.sound import SPEECH_RATE, on_video_clock, read_audio
 from personalize.split import make_split
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.landmarker import FaceLandmarker
@@ -125,7 +125,7 @@ def _read_sound(media: MediaInfo) -> tuple[F32, float]:
 
 def _without_sound(samples: F32, start: float, end: float) -> list[str]:
     """That the sound begins late or ends early. start: s after the first picture. end: s, of the pictures."""
-    known = (start, start + len(samples) / AUDIO_RATE)
+    known = (start, start + len(samples) / SPEECH_RATE)
     if known[0] <= MOST_SILENT_S and known[1] >= end - MOST_SILENT_S:
         return []
     return [

@@ -14,7 +14,7 @@ from personalize.errors import UserError
 from personalize.pictures import read_frames
 from personalize.render.track import TrackPictures, grid
 from personalize.run import RunFolder
-from personalize.sound import on_video_clock, read_audio
+from personalize.sound import FILM_RATE, on_video_clock, read_audio
 from personalize.video_writer import VideoWriter
 from tracker.head import HeadModel
 from tracker.overlay import MODES
@@ -22,7 +22,6 @@ from tracker.overlay import MODES
 CRF, PRESET = 22, "superfast"  # half of the time goes into encoding
 PREVIEW_CRF, PREVIEW_S = 30, 60.0
 WORST, SPREAD, COLUMNS = 8, 8, 4
-AUDIO_RATE = 48_000
 
 
 def check_modes(modes: Sequence[str]) -> None:
@@ -44,13 +43,13 @@ def write_overlay(
     half = (size[0] // 2, size[1] // 2)
     total, end = len(track.time), float(track.time[-1])
     fps = (total - 1) / end if total > 1 else 25.0
-    sound = on_video_clock(*read_audio(run.video, AUDIO_RATE), end + 1 / fps, AUDIO_RATE)
-    start = sound[: round(PREVIEW_S * AUDIO_RATE)]
+    sound = on_video_clock(*read_audio(run.video, FILM_RATE), end + 1 / fps, FILM_RATE)
+    start = sound[: round(PREVIEW_S * FILM_RATE)]
     notable = notable_frames(track.valid, track.confidence).tolist()
     tiles = {}
     with (
-        VideoWriter(folder / "overlay.mp4", fps, size, sound, AUDIO_RATE, CRF, PRESET) as film,
-        VideoWriter(folder / "preview.mp4", fps, half, start, AUDIO_RATE, PREVIEW_CRF, PRESET) as preview,
+        VideoWriter(folder / "overlay.mp4", fps, size, sound, FILM_RATE, CRF, PRESET) as film,
+        VideoWriter(folder / "preview.mp4", fps, half, start, FILM_RATE, PREVIEW_CRF, PRESET) as preview,
     ):
         for frame, (time, rgb) in enumerate(read_frames(run.video)):
             picture = pictures.film(rgb, frame)

@@ -15,14 +15,15 @@ from personalize.errors import UserError
 
 F32 = NDArray[np.float32]
 
-AUDIO_RATE = 16_000
+SPEECH_RATE = 16_000  # Hz, of sound that is measured and learnt from: the speech encoders want it
+FILM_RATE = 48_000  # Hz, of sound that people listen to
 # Sound is placed anew where its times leave the running count by more. Some containers round times to 1 ms.
 GAP_S = 0.01
 # Of the loudest channel: a mean that is quieter holds channels of opposite sign, or silent ones for the most part.
 CANCELLED = 0.3
 
 
-def read_audio(path: Path | str, rate: int = AUDIO_RATE) -> tuple[F32, float]:
+def read_audio(path: Path | str, rate: int = SPEECH_RATE) -> tuple[F32, float]:
     """Sound as (mono samples [S] f32 -1..1 at `rate` Hz, time s of the first sample from the first picture).
 
     Every packet lies at its presentation time: gaps are silence, a late start is kept. Of several sound streams it is
@@ -118,7 +119,7 @@ def _kind(frame: Any) -> tuple[str, str, int]:
     return frame.format.name, frame.layout.name, frame.sample_rate
 
 
-def on_video_clock(samples: F32, start_s: float, duration_s: float, rate: int = AUDIO_RATE) -> F32:
+def on_video_clock(samples: F32, start_s: float, duration_s: float, rate: int = SPEECH_RATE) -> F32:
     """Cut or fill with silence to [duration * rate]: sample k is at k / rate s after the first picture."""
     out = np.zeros(round(duration_s * rate), np.float32)
     place = round(start_s * rate)
@@ -127,7 +128,7 @@ def on_video_clock(samples: F32, start_s: float, duration_s: float, rate: int = 
     return out
 
 
-def write_wav(path: Path, samples: F32, rate: int = AUDIO_RATE) -> None:
+def write_wav(path: Path, samples: F32, rate: int = SPEECH_RATE) -> None:
     """Write mono f32 -1..1 as 16-bit PCM; louder samples are clipped."""
     pcm = np.round(np.clip(samples, -1, 1) * 32767).astype("<i2")
     with wave.open(str(path), "wb") as file:

@@ -11,7 +11,7 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
-from personalize.sound import AUDIO_RATE
+from personalize.sound import SPEECH_RATE
 
 _TIME_BASE = Fraction(1, 90_000)
 _BT709 = 1
@@ -31,7 +31,7 @@ class VideoWriter:
         fps: float,
         size: tuple[int, int],
         audio: NDArray[np.float32] | None = None,
-        audio_rate: int = AUDIO_RATE,
+        audio_rate: int = SPEECH_RATE,
         crf: int = 20,
         preset: str = "veryfast",
     ) -> None:

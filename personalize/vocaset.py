@@ -24,7 +24,7 @@ from model.motion import FPS
 from model.speech import resample
 from personalize.errors import UserError
 from personalize.restricted_pickle import read_pickle
-from personalize.sound import AUDIO_RATE, read_audio
+from personalize.sound import SPEECH_RATE, read_audio
 
 F32 = NDArray[np.float32]
 
@@ -132,8 +132,8 @@ class TrainingFiles(Vocaset):
             scale = 1.0 if samples.dtype.kind == "f" else 32768.0
             if not 8_000 <= rate <= 192_000:
                 raise ValueError(f"sample rate {rate}")
-            divisor = gcd(AUDIO_RATE, rate)
-            resampled = resample_poly(samples / scale, AUDIO_RATE // divisor, rate // divisor)
+            divisor = gcd(SPEECH_RATE, rate)
+            resampled = resample_poly(samples / scale, SPEECH_RATE // divisor, rate // divisor)
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(
                 f"{self.folder / 'raw_audio_fixed.pkl'}: the sound of {subject}, sentence {sentence}, is not"

@@ -22,9 +22,10 @@ from model.motion import FPS
 from model.speech import SpeechEncoder, load_encoder, resample
 from model.trainer import Trainer
 from model.training_config import TrainingConfig
+from personalize.sound import SPEECH_RATE
 from personalize.talkers.motion import talker_motion
 from personalize.talkers.style import Style
-from tools.flite_voices import SAMPLE_RATE, VOICES, monologue, record
+from tools.flite_voices import VOICES, monologue, record
 from tracker.head import ASSET as HEAD_ASSET
 from tracker.head import HeadModel, read_head
 
@@ -63,7 +64,7 @@ def talker_data(seed: int, encoder: SpeechEncoder, names: tuple[str, ...]) -> li
     random = np.random.default_rng((seed, 2))
     sentences = random.permutation(SENTENCES.read_text().splitlines())[:SENTENCES_EACH]
     speech = monologue([str(s) for s in sentences], VOICES[seed % len(VOICES)], seed)
-    duration = len(speech.audio) / SAMPLE_RATE
+    duration = len(speech.audio) / SPEECH_RATE
     takes = []
     for take in range(TAKES):
         motion = talker_motion(

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve, resample_poly
 
-from personalize.sound import read_audio
+from personalize.sound import SPEECH_RATE, read_audio
 from personalize.talkers.visemes import SILENCE, VISEMES, Phone
 
 F32 = NDArray[np.float32]
-SAMPLE_RATE = 16000  # Hz
 VOICES = ("rms", "slt", "awb", "kal16")
 STEPS = 100  # of the resampling ratio
 
@@ -37,7 +36,7 @@ def speak(sentence: str, voice: str, stretch: float) -> Speech:
         result = subprocess.run(
             [*command, "-o", str(path), "-t", sentence], check=True, capture_output=True, text=True
         )
-        audio, _ = read_audio(path, SAMPLE_RATE)
+        audio, _ = read_audio(path)
     phones, start = [], 0.0
     for word in result.stdout.split():
         name, end = word.split(":")
@@ -60,8 +59,8 @@ def monologue(sentences: Sequence[str], voice: str, seed: int) -> Speech:
 
     def pause(length: float) -> None:
         nonlocal now
-        sounds.append(np.zeros(round(length * SAMPLE_RATE), np.float32))
-        phones.append(Phone(SILENCE, now, now + len(sounds[-1]) / SAMPLE_RATE))
+        sounds.append(np.zeros(round(length * SPEECH_RATE), np.float32))
+        phones.append(Phone(SILENCE, now, now + len(sounds[-1]) / SPEECH_RATE))
         now = phones[-1].end
 
     pause(random.uniform(0.3, 1.0))
@@ -71,7 +70,7 @@ def monologue(sentences: Sequence[str], voice: str, seed: int) -> Speech:
         scale = up / down
         phones += [Phone(p.name, now + p.start * scale, now + p.end * scale) for p in speech.phones]
         sounds.append(audio / max(float(np.abs(audio).max()), 1e-6) * random.uniform(0.5, 1.0))
-        now += len(audio) / SAMPLE_RATE
+        now += len(audio) / SPEECH_RATE
         pause(random.uniform(0.1, 0.9))
     return Speech(np.concatenate(sounds), phones)
 
@@ -79,7 +78,7 @@ def monologue(sentences: Sequence[str], voice: str, seed: int) -> Speech:
 def record(audio: F32, seed: int) -> F32:
     """The same speech through another room, microphone and noise floor, drawn from `seed`."""
     random = np.random.default_rng(seed)
-    length = round(random.uniform(0.05, 0.4) * SAMPLE_RATE)
+    length = round(random.uniform(0.05, 0.4) * SPEECH_RATE)
     tail = random.standard_normal(length) * np.exp(-6.0 * np.arange(length) / length)
     tail *= random.uniform(0.0, 0.4) / np.linalg.norm(tail)
     tail[0] += 1.0

@@ -14,13 +14,12 @@ from personalize.pictures import read_frames
 from personalize.render.face import FaceCamera
 from personalize.render.text import caption
 from personalize.run import RunFolder, read_landmarks
-from personalize.sound import on_video_clock, read_audio
+from personalize.sound import FILM_RATE, on_video_clock, read_audio
 from personalize.video_writer import VideoWriter
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 PANEL = (400, 480)
-AUDIO_RATE = 48_000
 FACE_SHARE = 0.62
 CRF = 24
 
@@ -36,10 +35,10 @@ def write_clip(
 ) -> None:
     """time [n] s, reference and sample [n, K] m -> an mp4 of three pictures side by side at the motion's rate."""
     camera = FaceCamera(motion.template, motion.faces, checkpoint.regions["face"], PANEL)
-    sound, start_s = read_audio(run.video, AUDIO_RATE)
-    audio = on_video_clock(sound, start_s - float(time[0]), len(time) / motion.fps, AUDIO_RATE)
+    sound, start_s = read_audio(run.video, FILM_RATE)
+    audio = on_video_clock(sound, start_s - float(time[0]), len(time) / motion.fps, FILM_RATE)
     width, height = PANEL
-    with VideoWriter(path, motion.fps, (3 * width, height), audio, AUDIO_RATE, CRF) as film:
+    with VideoWriter(path, motion.fps, (3 * width, height), audio, FILM_RATE, CRF) as film:
         for index, picture in enumerate(_face_pictures(run, time)):
             panels = [caption(picture, "video")]
             for name, row in (("tracked", reference[index]), ("synthesized", sample[index])):

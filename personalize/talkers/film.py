@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from model.files import write_npz
 from personalize.render import mouth
-from personalize.sound import read_audio
+from personalize.sound import SPEECH_RATE, read_audio
 from personalize.talkers.motion import TalkerMotion, talker_motion
 from personalize.talkers.skin import backdrop, skin_block, texture
 from personalize.talkers.style import Style
@@ -142,7 +142,7 @@ def render_demo(
     audio, _ = read_audio(ASSETS / "demo_speech.flac")
     phones = load_phones(ASSETS / "demo_speech.json")
     style = Style.random(seed)
-    duration = len(audio) / 16000
+    duration = len(audio) / SPEECH_RATE
     motion = talker_motion(phones, duration, DEMO_FPS, seed, style, audio, DEMO_DISTANCE_M)
     identity = demo_identity(head, seed)
     return render_talker(path, motion, identity, head, DEMO_SIZE, DEMO_FOCAL_PX, seed, audio, progress)

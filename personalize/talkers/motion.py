@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from personalize.sound import SPEECH_RATE
 from personalize.talkers import upper_face
 from personalize.talkers.mouth import mouth_channels
 from personalize.talkers.noise import RATE, at_times, clock, smooth_noise
@@ -95,7 +96,7 @@ def talker_motion(
 
 def loudness(audio: F32, times: F64) -> F64:
     """[S] 0..1 at `times` [S] s: level of sound at 16 kHz between its quiet and its loud parts, smoothed."""
-    block = round(16000 / RATE)
+    block = round(SPEECH_RATE / RATE)
     padded = np.zeros(len(times) * block)
     padded[: min(len(audio), len(padded))] = audio[: len(padded)]
     level = 10 * np.log10(np.mean(padded.reshape(-1, block) ** 2, axis=1) + 1e-9)

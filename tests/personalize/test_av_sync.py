@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from personalize.av_sync import AUDIO_RATE, estimate_av_offset
+from personalize.av_sync import estimate_av_offset
+from personalize.sound import SPEECH_RATE
 from tracker.track import F32, F64
 
 SECONDS = 20.0
@@ -14,7 +15,7 @@ SECONDS = 20.0
 def speech(seed: int = 0) -> tuple[F64, F64, F32]:
     """Times [T] at 25 fps, opening [T] and sound of syllables whose loudness follows the opening, in sync."""
     rng = np.random.default_rng(seed)
-    fine = np.arange(round(SECONDS * AUDIO_RATE)) / AUDIO_RATE
+    fine = np.arange(round(SECONDS * SPEECH_RATE)) / SPEECH_RATE
     opening = np.zeros(len(fine))
     at = 0.3
     while at < SECONDS - 0.3:
