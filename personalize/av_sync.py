@@ -39,16 +39,10 @@ class AvOffset:
     """An estimate of how late the sound is against the picture (negative: early).
 
     sure: whether it is worth correcting: clear, alike in both halves of the clip, and larger than SMALLEST_S.
-    correlation: at the peak, -1..1. ratio: of the peak to the highest value elsewhere. deviations: the peak over the
-    root mean square elsewhere. halves_s: the estimates from the first and the second half.
     """
 
     offset_s: float
     sure: bool
-    correlation: float = 0.0
-    ratio: float = 0.0
-    deviations: float = 0.0
-    halves_s: tuple[float, float] = (0.0, 0.0)
 
 
 def estimate_av_offset(
@@ -77,7 +71,7 @@ def estimate_av_offset(
     deviations = float(values[best] / max(float(np.sqrt((elsewhere**2).mean())), 1e-9))
     ratio = float(values[best] / max(float(elsewhere.max()), 1e-9))
     first_half = np.cumsum(known) * 2 <= known.sum()
-    halves = tuple(_lag_s(_correlations(curve, known & half, loudness)) for half in (first_half, ~first_half))
+    halves = [_lag_s(_correlations(curve, known & half, loudness)) for half in (first_half, ~first_half)]
     offset_s = _lag_s(values)
     # Chance peaks shrink with the root of the time.
     least = max(LEAST_CORRELATION, MIN_CORRELATION * (20.0 / (known.sum() * STEP_S)) ** 0.5)
@@ -85,8 +79,7 @@ def estimate_av_offset(
     agree = max(abs(half - offset_s) for half in halves) <= HALVES_AGREE_S
     # A peak at the end of the range may be the flank of one outside it.
     inside = abs(best - MAX_LAG) < MAX_LAG - 2
-    sure = bool(clear and agree and inside and abs(offset_s) > SMALLEST_S)
-    return AvOffset(offset_s, sure, float(values[best]), ratio, deviations, (halves[0], halves[1]))
+    return AvOffset(offset_s, bool(clear and agree and inside and abs(offset_s) > SMALLEST_S))
 
 
 def _opening_curve(times: F64, opening: NDArray[np.floating], usable: Bool) -> tuple[F64, Bool, float]:
