@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from personalize.settings import Settings
 from personalize.subject_data import Span, SubjectData, base_path, load_subject_data
 
 F32 = NDArray[np.float32]
+System = Callable[[F32], F32]
 
 SYSTEMS = ("mean_motion", "ridge", "base", "personalized")
 SAMPLES = 10
@@ -42,25 +44,30 @@ class Evaluation:
     samples: F32
 
 
-def predict(
-    system: str, data: SubjectData, span: Span, subject: Checkpoint, base: Checkpoint, seed: int
-) -> F32:
-    """Coefficients [S, n, K] m that a system synthesizes for a span; S is 1 for the two that cannot vary."""
-    rows = slice(span.first, span.last)
-    train = np.concatenate([s.coefficients[s.valid] for s in data.sequences("train")])
+def built(system: str, data: SubjectData, subject: Checkpoint, base: Checkpoint, seed: int) -> System:
+    """A system by its name: from speech features [n, W] to coefficients [S, n, K] m.
+
+    S is 1 for the two that cannot vary.
+    """
     if system == "mean_motion":
-        return np.broadcast_to(train.mean(0), (1, span.last - span.first, train.shape[1])).astype(np.float32)
+        mean = np.concatenate([s.coefficients[s.valid] for s in data.sequences("train")]).mean(0)
+        return lambda features: np.tile(mean, (1, len(features), 1))
     if system == "ridge":
-        return Ridge.fit(data.sequences("train"), data.sequences("val")).predict(data.features[rows])[None]
-    if system == "personalized":
-        return synthesize(subject, data.features[rows], samples=SAMPLES, seed=seed)
-    # Nobody's style is known before personalization: each sample speaks in another of the base's.
+        ridge = Ridge.fit(data.sequences("train"), data.sequences("val"))
+        return lambda features: ridge.predict(features)[None]
+    if system == "base":
+        return lambda features: _in_all_styles(base, features, subject.guidance, seed)
+    return lambda features: synthesize(subject, features, samples=SAMPLES, seed=seed)
+
+
+def _in_all_styles(base: Checkpoint, features: F32, guidance: float, seed: int) -> F32:
+    """Nobody's style is known before personalization: each sample speaks in another of the base's."""
     styles = [base.styles[index % len(base.styles)] for index in range(SAMPLES)]
     drawn = [
-        synthesize(base, data.features[rows], style=style, guidance=subject.guidance, seed=seed + index)[0]
+        synthesize(base, features, style=style, guidance=guidance, seed=seed + index)
         for index, style in enumerate(styles)
     ]
-    return np.stack(drawn)
+    return np.concatenate(drawn)
 
 
 def evaluate_run(run: RunFolder, settings: Settings, folder: Path, report: Reporter) -> Evaluation:
@@ -76,17 +83,17 @@ def evaluate_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     systems: dict[str, dict[str, float]] = {}
     clip_span = max(spans, key=lambda span: int(span.sequence.valid.sum()))
     clip_samples: F32 = np.zeros(0, np.float32)
-    for done, system in enumerate(SYSTEMS):
-        rows = []
+    for done, name in enumerate(SYSTEMS):
+        system, rows = built(name, data, subject, base, settings.seed), []
         for span in spans:
-            samples = predict(system, data, span, subject, base, settings.seed)
+            samples = system(data.features[span.first : span.last])
             rows.append((score(samples, span.sequence, subject), int(span.sequence.valid.sum())))
-            if system == "personalized" and span is clip_span:
+            if name == "personalized" and span is clip_span:
                 clip_samples = samples
         weights = np.array([weight for _, weight in rows], float)
-        systems[system] = {
-            name: float(np.average([metrics[name] for metrics, _ in rows], weights=weights))
-            for name in rows[0][0]
+        systems[name] = {
+            metric: float(np.average([metrics[metric] for metrics, _ in rows], weights=weights))
+            for metric in rows[0][0]
         }
         report.progress(done + 1, len(SYSTEMS) + 1)
     metrics = {
