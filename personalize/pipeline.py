@@ -83,7 +83,7 @@ def personalize_video(
     # Asked before the lock so that a folder which is not ours is left as it is, and again once nobody else writes.
     run = RunFolder.create(folder, video)
     with run.locked():
-        run = RunFolder.create(folder, video)
+        run = run.reread()
         report.log_to(folder / "log.txt")
         run.begin(settings)
         try:

@@ -63,6 +63,15 @@ class RunFolder:
         """
         identity = {"name": video.name, "path": str(video.resolve()), "bytes": video.stat().st_size}
         identity["sha256"] = sha256_file(video)
+        return cls._of(path, identity)
+
+    def reread(self) -> RunFolder:
+        """The folder as it is by now, when another process may have written to it; refuses what `create` does."""
+        return self._of(self.path, self._state["video"])
+
+    @classmethod
+    def _of(cls, path: Path, identity: dict[str, Any]) -> RunFolder:
+        """The folder at `path` as it is, or a new one. identity: what run.json says of the video."""
         if (path / "run.json").is_file():
             run = cls.open(path)
             if run.video_sha256 != identity["sha256"]:

@@ -228,6 +228,21 @@ def test_another_videos_folder_is_refused(context: Context, tmp_path: Path) -> N
         RunFolder.create(tmp_path, other)
 
 
+def test_a_folder_read_again_is_as_others_left_it_and_the_video_is_not_read_again(tmp_path: Path) -> None:
+    videos = [tmp_path / name for name in ("talk.mp4", "other.mp4")]
+    for video in videos:
+        video.write_bytes(video.name.encode())
+    mine, same, other = (RunFolder.create(tmp_path / "run", videos[index]) for index in (0, 0, 1))
+    for video in videos:
+        video.unlink()
+    mine.path.mkdir()
+    same.begin(Settings())
+    same.record("count", {"key": "k", "seconds": 0.0, "outputs": {}})
+    assert list(mine.reread().stages) == ["count"]
+    with pytest.raises(UserError, match=r"another video \(talk.mp4\)"):
+        other.reread()
+
+
 @pytest.mark.parametrize(
     "damage",
     [
