@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.render.track import TrackPictures
 from personalize.run import RunFolder
 from tracker.albedo import Rendering, rerender
@@ -37,7 +37,7 @@ def shifts(run: RunFolder, head: HeadModel, used: NDArray[np.bool_]) -> F64:
     assert pictures.albedo is not None
     rows = parts(head, pictures.track.identity)
     found = np.full((len(used), len(PARTS)), np.nan)
-    for frame, (_, rgb) in enumerate(read_frames(run.video)):
+    for frame, (_, rgb) in enumerate(FrameReader(run.video)):
         if used[frame]:
             seen = pictures.scene(rgb, frame)
             found[frame] = beside(seen, rerender(seen, pictures.albedo), rows)

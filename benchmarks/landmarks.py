@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from tracker.landmarker import FaceLandmarker, LandmarkTracker
 
 FRAMES = 150
@@ -23,7 +23,7 @@ def measure(video: Path, threads: int) -> tuple[float, float, float, int]:
     tracker = LandmarkTracker(FaceLandmarker(threads))
     decoding, landmarking, faces = [], [], 0
     before = time.perf_counter()
-    for index, (_, rgb) in enumerate(read_frames(video)):
+    for index, (_, rgb) in enumerate(FrameReader(video)):
         decoded = time.perf_counter()
         faces += tracker.next(rgb) is not None
         after = time.perf_counter()

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from personalize.container import probe
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.quality import read_reasons
 from personalize.run import read_landmarks, read_track
 from personalize.sound import on_video_clock, read_audio
@@ -175,7 +175,7 @@ def write_spoiled(video: Path, out: Path, way: Picture | Spell, crf: int, points
     sound = on_video_clock(*read_audio(video), SECONDS)
     none = np.full((POINTS, 2), np.nan, np.float32)
     with VideoWriter(out, info.fps, (info.width, info.height), sound, crf=crf) as writer:
-        for frame, (time, rgb) in enumerate(read_frames(video)):
+        for frame, (time, rgb) in enumerate(FrameReader(video)):
             if time >= SECONDS:
                 break
             marks = points[frame] if frame < len(points) else none

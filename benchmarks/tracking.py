@@ -51,7 +51,7 @@ from benchmarks.track_errors import compare
 from personalize.container import probe
 from personalize.face_reading import read_face
 from personalize.ingest import find_usable
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from tracker.camera import FILM_MM, MIDDLE, MIDDLE_SD_LOG, estimate_camera
 from tracker.confidence import bare, judge
 from tracker.fit import fit_track
@@ -127,7 +127,7 @@ def stages(clip: Clip, head: HeadModel) -> Iterator[tuple[str, Track, dict[str, 
     if (video := clip.video) is not None:
         start = clock()
         refined = refine_track(
-            *(track, landmarks, camera, clip.bundle, head, clip.segment, lambda: read_frames(video)),
+            *(track, landmarks, camera, clip.bundle, head, clip.segment, lambda: FrameReader(video)),
             evidence=evidence,
         )
         spent += (clock() - start) / count

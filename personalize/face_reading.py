@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.shots import Frames
 from tracker.feature_tracks import FeatureFollower, FeatureTracks
 from tracker.landmarker import track_landmarks
@@ -21,7 +21,7 @@ def read_face(
     """Landmarks of the main person in all frames, how the face looks in each, and patches of the rigid upper face."""
     watch, follower = FaceWatch(), FeatureFollower(frames.time, frames.usable, frames.segment, frames.box)
     landmarks = track_landmarks(
-        read_frames(video),
+        FrameReader(video),
         len(frames.time),
         cuts=set(np.flatnonzero(np.diff(frames.segment)) + 1),
         boxes=frames.box,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from personalize.container import MediaInfo, probe, quantizer
 from personalize.errors import UserError
 from personalize.people import FaceFollower, Tracklet, main_person, sureness_of_turns
-from personalize.pictures import FrameReader, read_frames
+from personalize.pictures import FrameReader
 from personalize.shots import (
     CUT_WINDOW_S,
     F32,
@@ -227,7 +227,7 @@ class _Seen:
 
 def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
     landmarker = FaceLandmarker()
-    reader, follower = read_frames(media.path, SEARCH_SIDE), FaceFollower(landmarker)
+    reader, follower = FrameReader(media.path, SEARCH_SIDE), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
     recent = deque[float](maxlen=min(max(3, round(CUT_WINDOW_S * media.fps)), MOST_WINDOW))
     changes, rows, turns, next_look = Changes(), [], list[F64](), 0.0

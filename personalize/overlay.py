@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from model.files import write_bytes
 from personalize.errors import UserError
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.render.track import TrackPictures, grid
 from personalize.run import RunFolder
 from personalize.sound import FILM_RATE, on_video_clock, read_audio
@@ -51,7 +51,7 @@ def write_overlay(
         VideoWriter(folder / "overlay.mp4", fps, size, sound, FILM_RATE, CRF, PRESET) as film,
         VideoWriter(folder / "preview.mp4", fps, half, start, FILM_RATE, PREVIEW_CRF, PRESET) as preview,
     ):
-        for frame, (time, rgb) in enumerate(read_frames(run.video)):
+        for frame, (time, rgb) in enumerate(FrameReader(run.video)):
             picture = pictures.film(rgb, frame)
             film.write(picture, time)
             if time < PREVIEW_S:

@@ -119,11 +119,6 @@ class FrameReader(Iterator[tuple[float, U8]]):
         return np.asarray(rgb, np.uint8)
 
 
-def read_frames(path: Path | str, max_side: int | None = None) -> FrameReader:
-    """Pictures of a video, see FrameReader. `max_side`: shrink to at most this many px on the long side."""
-    return FrameReader(path, max_side)
-
-
 def _in_time(frames: Iterable[Any], start: float, step: float, path: Path) -> Generator[tuple[float, Any]]:
     """Those of a stream's frames that lie behind all before them: their times, s after `start`, and they themselves.
 

@@ -19,7 +19,7 @@ from personalize.finetune import finetune_run
 from personalize.heads import head_assets, run_head
 from personalize.ingest import ingest_video
 from personalize.overlay import write_overlay
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.quality import frame_reasons, lip_warnings, write_quality
 from personalize.registration import register_run
 from personalize.run import RunFolder
@@ -158,7 +158,7 @@ class Refine(Stage):
             *files.read_camera(root / "camera"),
             run_head(context.settings),
             files.read_frames(root / "ingest/frames.npz").segment,
-            lambda: read_frames(context.run.video),
+            lambda: FrameReader(context.run.video),
             context.report.progress,
             evidence=bare(files.read_appearance(root / "landmarks/appearance.npz")),
         )

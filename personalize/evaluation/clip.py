@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from model.checkpoint import Checkpoint
 from model.motion import Motion
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.render.face import FaceCamera
 from personalize.render.text import caption
 from personalize.run import RunFolder, read_landmarks
@@ -61,7 +61,7 @@ def _face_pictures(run: RunFolder, time: NDArray[np.float64]) -> list[U8]:
     shift = np.array([(PANEL[0] - 1) / 2, (PANEL[1] - 1) / 2]) - scale * middle
     window = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
     needed, pictures = set(shown.tolist()), {}
-    for frame, (_, rgb) in enumerate(read_frames(run.video)):
+    for frame, (_, rgb) in enumerate(FrameReader(run.video)):
         if frame in needed:
             pictures[frame] = cv2.warpAffine(rgb, window, PANEL, flags=cv2.INTER_CUBIC)
         if frame >= shown[-1]:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.quality import read_reasons
 from personalize.run import RunFolder, read_landmarks, read_track
 from tracker.albedo import Albedo, learn_albedo
@@ -62,7 +62,7 @@ class TrackPictures:
             keys = set(valid[np.linspace(0, len(valid) - 1, KEYS).round().astype(int)].tolist())
             albedo = learn_albedo(
                 scene(track.lens.picture(rgb), crop, track, frame, landmarks, head)
-                for frame, (_, rgb) in enumerate(read_frames(run.video))
+                for frame, (_, rgb) in enumerate(FrameReader(run.video))
                 if frame in keys
             )
         return cls(track, landmarks, reasons, head, modes, crop, albedo)

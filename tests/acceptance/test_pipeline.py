@@ -21,7 +21,7 @@ from model.checkpoint import Checkpoint
 from model.motion import Motion
 from personalize.demo import true_errors
 from personalize.evaluation.report import _facts, _warnings
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.run import RunFolder, read_refined, read_track, write_refined
 from personalize.sound import read_audio
 from personalize.talkers.film import ASSETS, Truth, demo_identity, render_talker
@@ -111,7 +111,7 @@ def test_the_overlay_plays_and_has_the_sound(finished: Path) -> None:
         assert film.streams.video[0].codec_context.name == "h264"
         assert film.streams.video[0].codec_context.pix_fmt == "yuv420p"
         assert film.streams.audio[0].codec_context.name == "aac"
-    assert sum(1 for _ in read_frames(finished / "overlay.mp4")) == round(SECONDS * FPS)
+    assert sum(1 for _ in FrameReader(finished / "overlay.mp4")) == round(SECONDS * FPS)
 
 
 def test_the_report_needs_no_other_file(finished: Path) -> None:

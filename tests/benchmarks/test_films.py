@@ -11,7 +11,7 @@ import pytest
 from benchmarks.films import MADE_BY, _Studio, film, film_key, shoot
 from benchmarks.ground_truth import GroundTruth
 from benchmarks.rendered_heads import SCENES, SPEECH, Scene, scene_motion, stranger
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.render.mouth import furnished
 from tests.personalize.mouth_view import assert_seen_between_parted_lips_only
 from tracker.head import HeadModel, load_head
@@ -35,7 +35,7 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, GroundTruth]:
 
 def test_landmarks_lie_on_the_true_face(shot: tuple[Path, GroundTruth]) -> None:
     path, truth = shot
-    landmarks = track_landmarks(read_frames(path), 5, set())
+    landmarks = track_landmarks(FrameReader(path), 5, set())
     assert (landmarks.presence > 0.9).all()
     posed = (truth.neutral + truth.displacement) @ truth.rotation.transpose(0, 2, 1) + truth.translation[
         :, None

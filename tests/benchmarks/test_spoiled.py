@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.spoiled import SPOILED, Cover, Shaken, blurred, lit, noisy, opening_errors, write_spoiled
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.run import write_track
 from tests.personalize.test_registration import track_of
 from tests.personalize.video_factory import write_video
@@ -72,7 +72,7 @@ def test_a_film_is_written_again_at_its_times(tmp_path: Path, points: np.ndarray
     path = write_video(tmp_path / "v.mp4", pictures, times)
     way, crf = SPOILED["as it is"]
     write_spoiled(path, tmp_path / "out.mp4", way, crf, points[None])
-    again = list(read_frames(tmp_path / "out.mp4"))
+    again = list(FrameReader(tmp_path / "out.mp4"))
     assert [time for time, _ in again] == pytest.approx(times, abs=1e-3)
     assert [rgb.mean() for _, rgb in again] == pytest.approx([60, 100, 140, 180], abs=3)
 

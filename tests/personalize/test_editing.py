@@ -16,7 +16,7 @@ from model.synthesis import synthesize
 from personalize import animation, editing
 from personalize.editing import EditSettings, edit_motion
 from personalize.errors import UserError
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.reporter import Reporter
 from personalize.sound import read_audio, write_wav
 from personalize.subject_data import BASE_CHECKPOINT, speech_features
@@ -84,7 +84,7 @@ def test_frames_and_regions_are_kept_and_films_have_sound(
     assert facts["synthetic"] and facts["source"] == "speech.wav" and facts["sample"] == 1
     assert facts["edit"]["keep"] == ":0.7,1.8:" and facts["edit"]["kept_frames"] == 12
     assert facts["edit"]["keep_regions"] == ["eyelids"] and facts["guidance"] == base.guidance
-    assert sum(1 for _ in read_frames(paths[1])) == FRAMES
+    assert sum(1 for _ in FrameReader(paths[1])) == FRAMES
     # The film begins with the motion, half a second into the sound.
     film, film_start = read_audio(paths[1], 16000)
     sound, _ = read_audio(speech, 16000)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from personalize.hdr import HLG, KNEE, PQ, _hlg, _pq, usual_range
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 
 COLOURS = np.array(  # skin, lips, greys, and the three primaries
     [
@@ -97,8 +97,8 @@ def test_a_film_of_high_range_is_read_in_the_colours_of_the_usual_one(
             frame.pts, frame.time_base = index, Fraction(1, 25)
             out.mux(stream.encode(frame))
         out.mux(stream.encode(None))
-    _, read = next(read_frames(path))
+    _, read = next(FrameReader(path))
     middles = read[16, 16::32].astype(float)
     np.testing.assert_allclose(middles, COLOURS, atol=3.0)
-    _, small = next(read_frames(path, max_side=160))
+    _, small = next(FrameReader(path, max_side=160))
     np.testing.assert_allclose(small[8, 8::16].astype(float), COLOURS, atol=3.0)

@@ -18,7 +18,7 @@ from av.sidedata.sidedata import Type as SideData
 
 from personalize.container import _quantizer, probe, quantizer
 from personalize.errors import UserError
-from personalize.pictures import _ahead, _in_time, _turned, read_frames
+from personalize.pictures import FrameReader, _ahead, _in_time, _turned
 from personalize.sound import on_video_clock, read_audio, write_wav
 from personalize.video_writer import VideoWriter
 from tests.personalize.video_factory import RATE, clicks, corner_picture, moving, write_sounds, write_video
@@ -36,7 +36,7 @@ def click_times(samples: np.ndarray, start: float, rate: int = 16_000) -> list[f
 def test_variable_rate_keeps_presentation_times(tmp_path: Path) -> None:
     times = [0.0, 0.04, 0.12, 0.3, 0.34, 1.0]
     path = write_video(tmp_path / "v.mkv", moving(6), [t + 2.0 for t in times])
-    assert [t for t, _ in read_frames(path)] == pytest.approx(times, abs=1e-3)
+    assert [t for t, _ in FrameReader(path)] == pytest.approx(times, abs=1e-3)
     assert probe(path).video_start_s == pytest.approx(2.0, abs=2e-3)
 
 
@@ -47,7 +47,7 @@ def test_rotation_metadata_is_applied(tmp_path: Path, rotation: int) -> None:
     path = write_video(tmp_path / "v.mp4", [stored] * 3, STEADY[:3], rotation=rotation)
     info = probe(path)
     assert (info.width, info.height) == (96, 64)
-    _, picture = next(read_frames(path))
+    _, picture = next(FrameReader(path))
     assert np.abs(picture.astype(int) - upright)[4:-4, 4:-4].mean() < 8
 
 
@@ -78,11 +78,11 @@ def test_a_reader_that_is_left_early_leaves_no_thread_behind(tmp_path: Path) -> 
         return False
 
     assert is_alone()
-    reader = read_frames(path)
+    reader = FrameReader(path)
     assert next(reader)[0] == 0 and any("ThreadPool" in t.name for t in threading.enumerate())
     del reader
     assert is_alone()
-    assert len(list(read_frames(path))) == 25 and is_alone()
+    assert len(list(FrameReader(path))) == 25 and is_alone()
 
 
 def test_a_reader_that_is_left_is_not_waited_for() -> None:
@@ -105,15 +105,15 @@ def test_a_reader_that_is_left_is_not_waited_for() -> None:
 def test_pixels_that_are_not_square_are_made_so(tmp_path: Path) -> None:
     path = write_video(tmp_path / "v.mkv", moving(3), STEADY[:3], aspect=Fraction(4, 3))
     assert (probe(path).width, probe(path).height) == (128, 64)
-    assert next(read_frames(path))[1].shape == (64, 128, 3)
+    assert next(FrameReader(path))[1].shape == (64, 128, 3)
 
 
 def test_ten_bits_and_smaller_pictures(tmp_path: Path) -> None:
     picture = corner_picture()
     path = write_video(tmp_path / "v.mkv", [picture] * 3, STEADY[:3], pixels="yuv420p10le")
-    _, read = next(read_frames(path))
+    _, read = next(FrameReader(path))
     assert read.dtype == np.uint8 and np.abs(read.astype(int) - picture)[4:-4, 4:-4].mean() < 8
-    assert next(read_frames(path, max_side=48))[1].shape == (32, 48, 3)
+    assert next(FrameReader(path, max_side=48))[1].shape == (32, 48, 3)
 
 
 def test_late_sound_and_gaps_keep_their_times(tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_recordings_joined_as_files_are_refused(tmp_path: Path) -> None:
     joined = tmp_path / "joined.ts"
     joined.write_bytes(b"".join(parts))
     with pytest.raises(UserError, match=r"joined\.ts: its clock is set back after 2\.4 s"):
-        list(read_frames(joined))
+        list(FrameReader(joined))
 
 
 @pytest.mark.parametrize("stamps", ["ahead", "equal", "early"])
@@ -160,7 +160,7 @@ def test_broken_time_stamps_cost_their_pictures_and_no_more(tmp_path: Path, stam
 def test_pictures_stored_in_another_order_keep_their_times_in_avi(tmp_path: Path) -> None:
     """It knows the order alone in which they are stored."""
     path = write_video(tmp_path / "v.avi", moving(60), [i / 25 for i in range(60)], options={"bf": "3"})
-    read = list(read_frames(path))
+    read = list(FrameReader(path))
     assert [t for t, _ in read] == pytest.approx([i / 25 for i in range(60)], abs=2e-3)
     assert [int(np.argmin([np.abs(p.astype(int) - q).mean() for q in moving(60)])) for _, p in read] == [
         *range(60)
@@ -180,18 +180,18 @@ def _joined(folder: Path, size: tuple[int, int]) -> Path:
 
 def test_pictures_that_change_their_shape_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"shape changes at 1\.0 s, from 96x64 to 64x96 px"):
-        list(read_frames(_joined(tmp_path, (64, 96))))
+        list(FrameReader(_joined(tmp_path, (64, 96))))
 
 
 def test_pictures_that_change_their_size_are_told(tmp_path: Path) -> None:
-    reader = read_frames(_joined(tmp_path, (192, 128)))
+    reader = FrameReader(_joined(tmp_path, (192, 128)))
     assert {picture.shape for _, picture in reader} == {(64, 96, 3)}
     assert reader.resized_s == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize(("flags", "woven"), [("", 0), ("+ildct+ilme", 25)])
 def test_interlaced_pictures_are_counted(tmp_path: Path, flags: str, woven: int) -> None:
-    reader = read_frames(
+    reader = FrameReader(
         write_video(tmp_path / "v.mkv", moving(25), STEADY, options={"flags": flags} if flags else {})
     )
     assert len(list(reader)) == 25 and reader.interlaced == woven and np.isnan(reader.resized_s)
@@ -230,7 +230,7 @@ def test_other_codecs_do_not_tell_how_coarsely_they_code(tmp_path: Path, codec: 
 def test_colours_that_cannot_be_read_are_named(tmp_path: Path, colours: int) -> None:
     path = write_video(tmp_path / "v.mp4", moving(3), STEADY[:3], colours=colours)
     with pytest.raises(UserError, match=r"its colours are (YCgCo|ICtCp)"):
-        list(read_frames(path))
+        list(FrameReader(path))
 
 
 def test_video_without_sound_gives_none(tmp_path: Path) -> None:
@@ -315,7 +315,7 @@ def test_damaged_pictures_are_named_until_the_next_key(tmp_path: Path) -> None:
     middle = len(data) // 2
     data[middle : middle + 3000] = rng.integers(0, 255, 3000, dtype=np.uint8).tobytes()
     path.write_bytes(data)
-    reader = read_frames(path)
+    reader = FrameReader(path)
     damaged = [reader.damaged for _ in reader]
     assert len(damaged) >= 20 and not damaged[0]
     assert any(damaged) or len(damaged) < 40
@@ -368,7 +368,7 @@ def test_written_video_reads_back_with_its_sound(tmp_path: Path) -> None:
     with VideoWriter(path, 30, (95, 63), audio=clicks([0.5], 1.0), audio_rate=RATE) as writer:
         for i, picture in enumerate(pictures):
             writer.write(picture, i / 30)
-    read = list(read_frames(path))
+    read = list(FrameReader(path))
     assert [t for t, _ in read] == pytest.approx([i / 30 for i in range(30)], abs=1e-3)
     assert read[0][1].shape == (64, 96, 3)
     assert np.abs(read[7][1][:63, :95].astype(int) - pictures[7]).mean() < 10
@@ -392,4 +392,4 @@ def test_pictures_nearer_than_the_clock_tells_apart_are_written_all_the_same(tmp
     with VideoWriter(tmp_path / "out.mp4", 25, (96, 64)) as writer:
         for time in times:
             writer.write(corner_picture(), time)
-    assert [t for t, _ in read_frames(tmp_path / "out.mp4")] == pytest.approx(times, abs=1e-4)
+    assert [t for t, _ in FrameReader(tmp_path / "out.mp4")] == pytest.approx(times, abs=1e-4)

@@ -9,7 +9,7 @@ import pytest
 
 from personalize.errors import UserError
 from personalize.overlay import COLUMNS, SPREAD, WORST, check_modes, notable_frames, write_overlay
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.quality import write_quality
 from personalize.render.track import BAD, FOOTER, GOOD, PANEL, TILE, TrackPictures, around_face, grid
 from personalize.run import RunFolder, write_landmarks, write_track
@@ -110,8 +110,8 @@ def test_the_film_shows_every_frame_in_every_mode_and_what_is_left_out(
     run: RunFolder, tmp_path: Path
 ) -> None:
     folder = make(run, tmp_path / "made", tuple(MODES))
-    film = [rgb for _, rgb in read_frames(folder / "overlay.mp4")]
-    assert len(film) == len(list(read_frames(folder / "preview.mp4"))) == FRAMES
+    film = [rgb for _, rgb in FrameReader(folder / "overlay.mp4")]
+    assert len(film) == len(list(FrameReader(folder / "preview.mp4"))) == FRAMES
     columns, rows = 3, 2
     height, width = (film[0].shape[0] - FOOTER) // rows, film[0].shape[1] // columns
     assert max(width, height) == PANEL

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from personalize.pictures import read_frames
+from personalize.pictures import FrameReader
 from personalize.talkers.film import ASSETS, DEMO_DISTANCE_M, Truth, demo_identity, render_talker
 from personalize.talkers.motion import FACING, talker_motion
 from personalize.talkers.style import Style
@@ -111,7 +111,7 @@ def test_film_and_truth_agree(tmp_path: Path) -> None:
     stored = Truth.load(tmp_path / "talker.truth.npz")
     np.testing.assert_array_equal(stored.expression, truth.expression)
     assert stored.head == f"{head.name}@{head.sha256}" and stored.focal == focal
-    frames = [rgb for _, rgb in read_frames(path)]
+    frames = [rgb for _, rgb in FrameReader(path)]
     assert len(frames) == len(stored.time) == 10
     face = stored.neutral[head.regions["face"]]
     nose = face[face[:, 2].argmax()]
