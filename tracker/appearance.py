@@ -99,11 +99,12 @@ def _spread(corners: F32) -> tuple[NDArray[np.int64], F32]:
 
 
 def seen_skin(
-    skin: Skin, head: HeadModel, vertices: F32, focal: float, principal: F64, size: tuple[int, int]
+    skin: Skin, head: HeadModel, vertices: F32, focal: float, principal: F64, size: tuple[int, int], own: F64
 ) -> tuple[Bool, F32]:
     """Which points [P] a picture shows, by rasterization, and their normals [P, 3] in the camera frame.
 
-    vertices: [D, 3] m, camera frame. focal, principal, size: of the picture, px.
+    vertices: [D, 3] m, camera frame. focal, principal, size: of the picture, px. own: [2, 2] px, the first and last
+    (x, y) in it that the camera saw.
     """
     corners = head.faces[skin.triangles]
     fields = (vertices, vertex_normals(vertices, head.faces))
@@ -114,8 +115,9 @@ def seen_skin(
     width, height = (int(np.ceil(COARSE * side)) for side in size)
     depth = rasterize(pixels, head.faces, (width, height)).depth
     place = project(points, focal, principal)
-    inside = np.all((place >= 0) & (place <= np.array(size) - 1), axis=1)
-    column, row = np.where(inside[:, None], COARSE * place, 0).astype(int).T
+    inside = np.all((place >= own[0]) & (place <= own[1]), axis=1)
+    at = np.round(COARSE * np.where(inside[:, None], place, 0)).astype(int)
+    column, row = np.minimum(at, (width - 1, height - 1)).T
     return inside & (points[:, 2] < depth[row, column] + MARGIN_M) & (facing > FACING), normal
 
 

@@ -18,6 +18,7 @@ from tracker.landmarker import crop, roi_from_points
 from tracker.track import F32, F64
 
 U8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
 
 SIDE = 128  # px of the face's crop, about 36 of them between the outer corners of the eyes
 SMOOTHING_PX = 2.0  # of the crop: colours of patches, not of pores and noise
@@ -29,6 +30,9 @@ FRAMES_PER_PATTERN = 20  # fewer would make each frame its own pattern
 # Share of the frames that are taken to show the bare face; in the end those too that look no stranger to these than
 # ALIKE: other turns and lights. Not again and again, or the pattern would follow a hand from its first finger on.
 TRUSTED, TRUSTING, ALIKE = 0.5, 4, 0.12  # TRUSTING: rounds
+OFTEN = (
+    0.5  # of the frames, or of a region: landmarks that lie less in the picture are left out, or not made up
+)
 LEAST_POINTS = 20  # of a region: in a clip of profiles the far side has fewer
 MIDDLE = 0.05  # of the distance between the eyes, to either side
 EYE_REACH = 0.27  # of the distance between the eyes: lids and gaze change within it and cover nothing
@@ -53,6 +57,7 @@ class FaceWatch:
     def __init__(self) -> None:
         self._colour: list[U8] = []
         self._place: list[NDArray[np.float16]] = []
+        self._inside: list[Bool] = []
         self._detail: list[float] = []
 
     def see(self, rgb: U8, points: F32) -> None:
@@ -60,6 +65,7 @@ class FaceWatch:
         if not np.isfinite(points).all():
             self._colour.append(np.zeros((POINTS, 3), np.uint8))
             self._place.append(np.full((POINTS, 2), np.nan, np.float16))
+            self._inside.append(np.zeros(POINTS, bool))
             self._detail.append(np.nan)
             return
         roi = roi_from_points(points)
@@ -72,6 +78,9 @@ class FaceWatch:
             cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(np.uint8)
         )
         self._place.append(unit.astype(np.float16))
+        size = np.array(rgb.shape[1::-1])
+        shown: Bool = np.all((points[:, :2] >= 0) & (points[:, :2] <= size - 1), axis=1)
+        self._inside.append(shown)
         self._detail.append(_detail(cv2.cvtColor(face, cv2.COLOR_RGB2GRAY)))
 
     def appearance(self, usable: NDArray[np.bool_]) -> Appearance:
@@ -81,11 +90,15 @@ class FaceWatch:
         seen = np.flatnonzero(np.isfinite(detail) & usable)
         if len(seen):
             colour, place = np.stack(self._colour)[seen], np.stack(self._place)[seen]
-            for region in regions(np.median(place, axis=0).astype(np.float64)):
+            inside = np.stack(self._inside)[seen]
+            # Without all of the mouth a face may look as strange as it does.
+            inside |= ~inside[:, list(LIPS)].all(1, keepdims=True)
+            for region in regions(np.median(place, axis=0).astype(np.float64), inside.mean(0) > OFTEN):
                 width = np.ptp(place[:, region, 0].astype(np.float32), axis=1)
                 # A side that turns away is seen at a slant, and at its rim the background.
                 slant = np.minimum(width / np.median(width), 1.0) ** 2
-                strangeness[seen] = np.maximum(strangeness[seen], slant * _strangeness(colour[:, region]))
+                strange = _strangeness(colour[:, region], inside[:, region])
+                strangeness[seen] = np.maximum(strangeness[seen], slant * strange)
             sharpness[seen] = detail[seen] / max(float(np.median(detail[seen])), 1e-6)
         return Appearance(strangeness, sharpness)
 
@@ -97,16 +110,17 @@ def _detail(face: U8) -> float:
     return float(edges.mean() / (face[inside].mean() + DARK))
 
 
-def regions(place: NDArray[np.floating]) -> list[NDArray[np.intp]]:
+def regions(place: NDArray[np.floating], known: Bool) -> list[NDArray[np.intp]]:
     """Landmarks of each side of the mouth with the chin, and of the upper face, without the eyes and the rim.
 
     The mouth's sides share its middle. With half of it covered the mouth as a whole looks much alike. place: [478, 2],
-    a typical face, upright, in any unit.
+    a typical face, upright, in any unit. known: [478], landmarks that are in the picture.
     """
     eyes = float(np.linalg.norm(place[RIGHT_EYE_OUTER] - place[LEFT_EYE_OUTER]))
     to_iris = [np.linalg.norm(place - place[iris], axis=1) for iris in IRIS_CENTRES]
     skin = np.minimum(*to_iris) > EYE_REACH * eyes
     skin[list(OVAL)] = False
+    skin &= known
     x, y = ((place - place[list(LIPS)].mean(0)) / eyes).T
     mouth = (np.abs(x) < 0.5) & (y > -0.25) & (y < 0.4)
     sides = (mouth & (x < MIDDLE), mouth & (x > -MIDDLE), ~mouth & (x < -MIDDLE), ~mouth & (x > MIDDLE))
@@ -114,10 +128,17 @@ def regions(place: NDArray[np.floating]) -> list[NDArray[np.intp]]:
     return [part for part in parts if len(part) >= LEAST_POINTS]
 
 
-def _strangeness(colour: U8) -> F64:
-    """[n] 1 - correlation of a region's colours [n, R, 3] with the nearest pattern of the face's own."""
+def _strangeness(colour: U8, inside: Bool) -> F64:
+    """[n] 1 - correlation of a region's colours [n, R, 3] with the nearest pattern of the face's own.
+
+    inside: [n, R]; landmarks outside of the picture, whose colours are its border's, look as they usually do, where
+    that is less than half of the region.
+    """
+    inside = inside | (inside.mean(1, keepdims=True) < OFTEN)
     learned = np.unique(np.linspace(0, len(colour) - 1, LEARNED).round().astype(int))
-    values = _contrasts(colour[learned])
+    shown = inside[learned, :, None]
+    usual = (_logs(colour[learned]) * shown).sum(0) / np.maximum(shown.sum(0), 1)
+    values = _contrasts(colour[learned], inside[learned], usual)
     patterns, mean = np.zeros((0, values.shape[1])), np.median(values, axis=0)
     for step in range(TRUSTING + 1):
         strange = _unlike(values, mean, patterns)
@@ -129,13 +150,24 @@ def _strangeness(colour: U8) -> F64:
         patterns = np.linalg.svd(values[taken] - mean, full_matrices=False)[2]
         patterns = patterns[: min(PATTERNS, len(taken) // FRAMES_PER_PATTERN)]
     # Some at a time: of all frames of an hour these would fill gigabytes.
-    parts = (colour[start : start + LEARNED] for start in range(0, len(colour), LEARNED))
-    return np.concatenate([_unlike(_contrasts(part), mean, patterns) for part in parts])
+    parts = (slice(start, start + LEARNED) for start in range(0, len(colour), LEARNED))
+    return np.concatenate(
+        [_unlike(_contrasts(colour[part], inside[part], usual), mean, patterns) for part in parts]
+    )
 
 
-def _contrasts(colour: U8) -> F64:
-    """[n, 3 R] log colours of a region [n, R, 3] about their mean."""
-    logs = np.log(colour.astype(np.float64) + DARK)
+def _logs(colour: U8) -> F64:
+    return np.log(colour.astype(np.float64) + DARK)
+
+
+def _contrasts(colour: U8, inside: Bool, usual: F64) -> F64:
+    """[n, 3 R] log colours of a region [n, R, 3] about their mean.
+
+    Those not inside [n, R] are the `usual` ones [R, 3], as much brighter as the others are.
+    """
+    logs, shown = _logs(colour), inside[..., None]
+    brighter = ((logs - usual) * shown).sum(1, keepdims=True) / shown.sum(1, keepdims=True)
+    logs = np.where(shown, logs, usual + brighter)
     return (logs - logs.mean(1, keepdims=True)).reshape(len(logs), -1)
 
 

@@ -86,9 +86,11 @@ class Subject:
     photometry: Photometry
 
     @classmethod
-    def of(cls, head: HeadModel, identity: F32, energy: Energy, photometry: Photometry) -> Subject:
-        """The subject with sample points on the skin and windows around the landmarks."""
-        window = Window.around(energy.observed, energy.px_per_m, photometry.finest_px_per_m)
+    def of(
+        cls, head: HeadModel, identity: F32, energy: Energy, photometry: Photometry, size: tuple[int, int]
+    ) -> Subject:
+        """The subject with sample points on the skin and windows around the landmarks. size: of the pictures, px."""
+        window = Window.around(energy.observed, energy.px_per_m, photometry.finest_px_per_m, size)
         weights = replace(
             energy.weights,
             pair_noise_mm=photometry.pair_noise_mm,
@@ -133,7 +135,8 @@ class Subject:
             camera = (face @ matrix[n].T + x[n, -3:]).astype(np.float32)
             principal = window.principal(self.energy.principal, row)
             focal = self.energy.focal * window.scale
-            seen[n], normals[n] = seen_skin(self.skin, self.head, camera, focal, principal, window.size)
+            own = window.own(int(row), self.blurs_px[0])
+            seen[n], normals[n] = seen_skin(self.skin, self.head, camera, focal, principal, window.size, own)
         return seen, harmonics(normals)
 
     def photometric(self, cuts: Sequence[U8], rows: Index, seen: F32, blur_px: float) -> PhotometricEnergy:

@@ -26,14 +26,16 @@ class Window:
     """Where the face lies in each of n pictures: q of the whole picture is at (q - origin + 1/2) * scale - 1/2.
 
     origin: [n, 2] px of the whole picture, whole numbers. scale: at most 1. size: (width, height) of what is cut out.
+    whole: that of the whole picture.
     """
 
     origin: F64
     scale: float
     size: tuple[int, int]
+    whole: tuple[int, int]
 
     @classmethod
-    def around(cls, observed: F64, px_per_m: F64, finest_px_per_m: float) -> Window:
+    def around(cls, observed: F64, px_per_m: F64, finest_px_per_m: float, whole: tuple[int, int]) -> Window:
         """Windows of one size around landmarks [n, L, 2] px, shrunk to `finest_px_per_m` in the clip's median.
 
         They hold the largest face, but for one that is more than LARGEST times the usual.
@@ -43,7 +45,7 @@ class Window:
         extent = np.minimum((high - low).max(0), LARGEST * np.median(high - low, axis=0))
         size = np.ceil(extent * MARGIN * scale).astype(int)
         origin = np.floor((low + high) / 2 - size / scale / 2)
-        return cls(origin, scale, (int(size[0]), int(size[1])))
+        return cls(origin, scale, (int(size[0]), int(size[1])), whole)
 
     def cut(self, rgb: U8, row: int) -> U8:
         """[height, width] u8 grey; outside of the picture its border goes on."""
@@ -61,6 +63,16 @@ class Window:
         # By the scale and not to a size, to which it would be stretched.
         shrunk = cv2.resize(halved(grey, times), None, fx=rest, fy=rest, interpolation=cv2.INTER_AREA)
         return shrunk[: self.size[1], : self.size[0]]
+
+    def own(self, row: int, margin: float) -> F64:
+        """[2, 2] px, first and last (x, y) of a cut picture that it shows: beyond them the whole one's border goes on.
+
+        margin: px farther in where it does, of a blur that takes the border along.
+        """
+        ends = np.array([(0.0, 0.0), np.array(self.whole) - 1.0])
+        first, last = (ends - self.origin[row] + 0.5) * self.scale - 0.5
+        edge = np.array(self.size) - 1.0
+        return np.stack([np.where(first > 0, first + margin, 0), np.where(last < edge, last - margin, edge)])
 
     def principal(self, principal: F64, row: int | slice) -> F64:
         """[2] px, the principal point in one cut picture, or [.., 2] in several."""

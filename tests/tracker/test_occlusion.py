@@ -1,5 +1,7 @@
 """A textured face that moves: what covers or blurs it is told from what it does itself."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -104,6 +106,27 @@ def test_a_mouth_that_is_covered_on_one_side_looks_strange_however_slowly_it_cam
     assert seen.strangeness[covered == 0].max() < 0.08
 
 
+def lifted(frames, landmarks, cut_px):
+    """The same without the upper cut_px [T] px of each picture, whose face then lies as much higher."""
+    points = landmarks.points.copy()
+    points[:, :, 1] -= cut_px[:, None]
+    cut = [(time, rgb[c:]) for (time, rgb), c in zip(frames, cut_px)]
+    return cut, replace(landmarks, points=points)
+
+
+def test_a_forehead_outside_of_the_picture_is_no_cover():
+    """Of a head that leaves the picture at its upper edge again and again; covers of its mouth are still seen."""
+    top = int(POINTS_PX[:, 1].min())
+    cut_px = np.where(np.arange(FRAMES) % 12 < 5, top + 45, 0)
+    seen = look(*lifted(*clip(), cut_px))
+    assert seen.strangeness.max() < 0.08
+    covered = np.zeros(FRAMES)
+    covered[26:34] = 1.0
+    seen = look(*lifted(*clip(covered), cut_px))
+    assert seen.strangeness[covered == 1].min() > 0.3
+    assert seen.strangeness[covered == 0].max() < 0.08
+
+
 def test_light_that_comes_from_elsewhere_little_by_little_is_no_cover():
     across = np.linspace(-1, 1, SIDE)[None, :, None]
 
@@ -157,7 +180,7 @@ def test_an_all_black_clip_is_finite():
 
 
 def test_the_regions_are_apart_and_leave_out_eyes_and_rim():
-    right, left, *upper = (set(part.tolist()) for part in regions(POINTS_PX))
+    right, left, *upper = (set(part.tolist()) for part in regions(POINTS_PX, np.ones(len(POINTS_PX), bool)))
     mouth = right | left
     together = set.union(mouth, *upper)
     assert len(together) == len(mouth) + sum(map(len, upper))

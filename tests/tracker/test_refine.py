@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tracker import refine
 from tracker.confidence import judge
-from tracker.energy import LIP_PAIRS
+from tracker.energy import LIP_PAIRS, rotation_matrix
 from tracker.fit import fit_track, make_track, resume
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
@@ -149,6 +149,19 @@ def test_how_fine_the_light_is_is_told_by_the_whole_clip(dark_mouth: Film, monke
     assert dark_mouth.refine(pictures).fineness == at_once < 0.8 * dark_mouth.refine().fineness
 
 
+def test_skin_outside_of_the_picture_is_not_seen(film: Film):
+    energy, x, _, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
+    first, size = np.zeros(1, np.int64), (SIZE[0], 150)
+    whole, cut = (Subject.of(HEAD, film.track.identity, energy, Photometry(), s) for s in (SIZE, size))
+    seen, fewer = (subject.look(first, x[first])[0][0] > 0 for subject in (whole, cut))
+    # In the first frame the face is at rest.
+    place = whole.skin.rest @ rotation_matrix(x[:1, -6:-3])[0].T + x[0, -3:]
+    y = FOCAL * place[:, 1] / place[:, 2] + CAMERA.principal_px[1]
+    assert 0.1 < fewer.sum() / seen.sum() < 0.9
+    assert not fewer[y > size[1] - 1].any()
+    np.testing.assert_array_equal(fewer[y < size[1] - 8], seen[y < size[1] - 8])
+
+
 @pytest.mark.xfail(
     reason="a lit tongue of the lips' colour tells nothing, and landmarks err by a quarter pixel", strict=True
 )
@@ -164,7 +177,7 @@ def test_what_landmarks_read_of_shut_lips_is_forgotten_when_colours_read_them(fi
     far = replace(energy, model=replace(energy.model, touch=energy.model.touch + 0.001))
     near, apart = (
         _with_landmarks(
-            Subject.of(HEAD, film.track.identity, start, Photometry()), read, x, sound
+            Subject.of(HEAD, film.track.identity, start, Photometry(), SIZE), read, x, sound
         ).energy.model
         for start in (energy, far)
     )

@@ -12,7 +12,7 @@ ORIGIN, SIZE = (7, 5), (97, 61)
 
 @pytest.mark.parametrize("scale", [1.0, 0.83, 0.64, 0.5, 0.37, 0.31])
 def test_a_ramp_is_read_where_it_was(scale: float) -> None:
-    window = Window(np.array([ORIGIN], np.float64), scale, SIZE)
+    window = Window(np.array([ORIGIN], np.float64), scale, SIZE, (640, 640))
     slope = 0.6
     random = np.random.default_rng(0)
 
@@ -30,3 +30,10 @@ def test_a_ramp_is_read_where_it_was(scale: float) -> None:
     inside = expected < 395
     line = np.polyval(np.polyfit(expected[inside], found[inside], 1), expected[inside])
     assert np.abs(line - expected[inside]).max() < 0.15
+
+
+def test_what_lies_outside_of_the_picture_is_not_its_own() -> None:
+    window = Window(np.array([[-20.0, 30.0]]), 0.5, (60, 50), (90, 200))
+    # 20 px of the left border at half the size are 10; the picture ends 90 px on, and goes on below the window.
+    np.testing.assert_allclose(window.own(0, 0.0), [[9.75, 0], [54.25, 49]])
+    np.testing.assert_allclose(window.own(0, 2.0), [[11.75, 0], [52.25, 49]])
