@@ -70,7 +70,7 @@ class Ingest(Stage):
 class LandmarkStage(Stage):
     """478 points and 52 scores on every frame that shows the face, what covers or blurs it, and rigid features."""
 
-    name, version = "landmarks", 6
+    name, version = "landmarks", 7
     needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz", "features.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
