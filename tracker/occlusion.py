@@ -131,17 +131,18 @@ def regions(place: NDArray[np.floating], known: Bool) -> list[NDArray[np.intp]]:
 def _strangeness(colour: U8, inside: Bool) -> F64:
     """[n] 1 - correlation of a region's colours [n, R, 3] with the nearest pattern of the face's own.
 
-    inside: [n, R]; landmarks outside of the picture, whose colours are its border's, look as they usually do, where
-    that is less than half of the region.
+    inside: [n, R]; landmarks outside of the picture, whose colours are its border's, do not count where they are less
+    than half of the region.
     """
     inside = inside | (inside.mean(1, keepdims=True) < OFTEN)
     learned = np.unique(np.linspace(0, len(colour) - 1, LEARNED).round().astype(int))
     shown = inside[learned, :, None]
     usual = (_logs(colour[learned]) * shown).sum(0) / np.maximum(shown.sum(0), 1)
     values = _contrasts(colour[learned], inside[learned], usual)
+    told = np.repeat(inside, 3, axis=1)  # values that come from the picture
     patterns, mean = np.zeros((0, values.shape[1])), np.median(values, axis=0)
     for step in range(TRUSTING + 1):
-        strange = _unlike(values, mean, patterns)
+        strange = _unlike(values, told[learned], mean, patterns)
         count = max(1, round(TRUSTED * len(learned)))
         if step == TRUSTING:
             count = max(count, int((strange <= ALIKE).sum()))
@@ -152,7 +153,7 @@ def _strangeness(colour: U8, inside: Bool) -> F64:
     # Some at a time: of all frames of an hour these would fill gigabytes.
     parts = (slice(start, start + LEARNED) for start in range(0, len(colour), LEARNED))
     return np.concatenate(
-        [_unlike(_contrasts(colour[part], inside[part], usual), mean, patterns) for part in parts]
+        [_unlike(_contrasts(colour[p], inside[p], usual), told[p], mean, patterns) for p in parts]
     )
 
 
@@ -171,9 +172,11 @@ def _contrasts(colour: U8, inside: Bool, usual: F64) -> F64:
     return (logs - logs.mean(1, keepdims=True)).reshape(len(logs), -1)
 
 
-def _unlike(values: F64, mean: F64, patterns: F64) -> F64:
+def _unlike(values: F64, told: Bool, mean: F64, patterns: F64) -> F64:
+    """[n] 1 - correlation of those values [n, V] that are told [n, V] with the nearest pattern."""
     away = values - mean
     nearest = mean + (away @ patterns.T) @ patterns
-    floor = CONTRAST**2 * values.shape[1]
+    floor = CONTRAST**2 * told.sum(1)
+    values, nearest = values * told, nearest * told
     together = (values * nearest).sum(1) + floor
     return 1 - together / np.sqrt(((values**2).sum(1) + floor) * ((nearest**2).sum(1) + floor))
