@@ -94,9 +94,8 @@ def main() -> None:
     """Entry point. Exit codes: 0 done, 2 the user's input, 130 interrupted, 1 a bug."""
     arguments = with_default_command(sys.argv[1:]) or ["--help"]
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(
-            errors="surrogateescape"
-        )  # names of files that are no text are printed as they are
+        # Names of files that are no text are printed as they are.
+        sys.stdout.reconfigure(errors="surrogateescape")
     interruptions = _interruptions()
     try:
         code = app(arguments, standalone_mode=False)
