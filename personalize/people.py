@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.face_detector import Face
+from tracker.face_detector import Face, merged
 from tracker.landmarker import FaceLandmarker, roi_from_face
 
 U8 = NDArray[np.uint8]
@@ -137,7 +136,8 @@ class FaceFollower:
     def _find(self, time: float, rgb: U8) -> list[Face]:
         faces = self._landmarker.detect(rgb)
         if not faces:
-            faces = _distinct(f for t in self._open for f in self._find_near(t.sightings[-1].box, rgb))
+            # The surroundings of two may show the same face.
+            faces = merged(f for t in self._open for f in self._find_near(t.sightings[-1].box, rgb))
         if not faces and time >= self._next_search:
             self._next_search = time + SEARCH_S
             faces = self._landmarker.detect(rgb, tiled=True)
@@ -155,15 +155,6 @@ class FaceFollower:
         tracklet.next_sample = time + SAMPLE_S
         points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
         return (points, _portrait(rgb, points)) if presence >= MIN_PRESENCE else None
-
-
-def _distinct(faces: Iterable[Face]) -> list[Face]:
-    """Each face once: the surroundings of several others may show the same one."""
-    found: list[Face] = []
-    for face in sorted(faces, key=lambda face: -face.score):
-        if all(_overlap(face.box, other.box) < MIN_OVERLAP for other in found):
-            found.append(face)
-    return found
 
 
 def around(rgb: U8, box: F32) -> tuple[U8, F32]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -82,6 +82,18 @@ def merge(points: F32, scores: F32) -> list[tuple[F32, float]]:
     return faces
 
 
+def merged(faces: Iterable[Face]) -> list[Face]:
+    """Faces found in several parts of a picture, each once, best score first."""
+    found = list(faces)
+    points = [np.concatenate([face.box.reshape(2, 2), face.keypoints]) for face in found]
+    return _faces(np.stack(points), np.array([face.score for face in found], np.float32)) if found else []
+
+
+def _faces(points: F32, scores: F32) -> list[Face]:
+    """As `merge`."""
+    return [Face(p[:2].reshape(4), p[2:], score) for p, score in merge(points, scores)]
+
+
 def letterbox(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float, tuple[int, int]]:
     """The picture [H, W, 3] inside a black INPUT_SIZE square: (square, scale, (left, top) border in px)."""
     times = int(np.log2(max(*rgb.shape[:2], INPUT_SIZE) / INPUT_SIZE))
@@ -129,14 +141,10 @@ class FaceDetector:
                 break
             for left, top, side in tiles(width, height, divisor):
                 found += self._detect_in(rgb[top : top + side, left : left + side], (left, top))
-        if not found:
-            return []
-        points = np.stack([p for p, _ in found])
-        scores = np.array([s for _, s in found], np.float32)
-        return [Face(p[:2].reshape(4), p[2:], score) for p, score in merge(points, scores)]
+        return merged(found)
 
-    def _detect_in(self, rgb: NDArray[np.uint8], offset: tuple[int, int]) -> list[tuple[F32, float]]:
-        """(points [8, 2] px of the whole picture, score) of faces in one cut-out at `offset` (left, top)."""
+    def _detect_in(self, rgb: NDArray[np.uint8], offset: tuple[int, int]) -> list[Face]:
+        """Faces, in px of the whole picture, in one cut-out at `offset` (left, top)."""
         square, scale, border = letterbox(rgb)
         self._network.set_tensor(self._input, (square.astype(np.float32) / 127.5 - 1.0)[None])
         self._network.invoke()
@@ -145,4 +153,4 @@ class FaceDetector:
         points, scores = decode(regressors, logits, self._anchors)
         # Edges of the input are at 0 and 1, so pixel centres are at (i + 0.5) / INPUT_SIZE.
         pixels = (points * INPUT_SIZE - np.array(border, np.float32)) / scale - 0.5
-        return merge(pixels + np.array(offset, np.float32), scores)
+        return _faces(pixels + np.array(offset, np.float32), scores)

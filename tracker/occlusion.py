@@ -30,9 +30,9 @@ FRAMES_PER_PATTERN = 20  # fewer would make each frame its own pattern
 # Share of the frames that are taken to show the bare face; in the end those too that look no stranger to these than
 # ALIKE: other turns and lights. Not again and again, or the pattern would follow a hand from its first finger on.
 TRUSTED, TRUSTING, ALIKE = 0.5, 4, 0.12  # TRUSTING: rounds
-OFTEN = (
-    0.5  # of the frames, or of a region: landmarks that lie less in the picture are left out, or not made up
-)
+# Of the frames: landmarks that are in fewer of the pictures are left out. Of a region: with less of it in the picture
+# its border's colours count, as strange as they are.
+OFTEN = 0.5
 LEAST_POINTS = 20  # of a region: in a clip of profiles the far side has fewer
 MIDDLE = 0.05  # of the distance between the eyes, to either side
 EYE_REACH = 0.27  # of the distance between the eyes: lids and gaze change within it and cover nothing
