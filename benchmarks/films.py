@@ -133,6 +133,7 @@ class _Studio:
         self._detail = mouth.MouthDetail.of(person, len(self._places), scene.seed)
         noses = self._turns.apply(person.template[person.regions["face"]].mean(0)) + moves.translation
         self._path = project(noses, scene.focal * max(scene.size), (0, 0))
+        self._shot = np.arange(len(noses)) // (scene.shot_s * FPS)
 
     def picture(self, frame: int, vertices: F32) -> tuple[U8, float]:
         """What the camera records of vertices [D, 3] m in the head frame, and the share of the lips covered.
@@ -184,7 +185,8 @@ class _Studio:
         """Shrunk to size, blurred by movement and lens, with noise."""
         scene = self._scene
         small = cv2.resize(picture, scene.size, interpolation=cv2.INTER_AREA)
-        before, after = max(frame - 1, 0), min(frame + 1, len(self._path) - 1)
+        shot = np.flatnonzero(self._shot == self._shot[frame])  # nothing moves across a cut
+        before, after = max(frame - 1, shot[0]), min(frame + 1, shot[-1])
         moved = scene.shutter * (self._path[after] - self._path[before]) / max(after - before, 1)
         if np.linalg.norm(moved) > SHORT_PX:
             small = cv2.filter2D(small, -1, _streak(moved))

@@ -13,12 +13,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 
 BLUE, ORANGE, GREY, GREEN, RED = "#2f6fb3", "#d9822b", "#9aa0a6", "#3c9a5f", "#c8443a"
+LABEL_PX = 16  # apart, or one would cover the other
 
 
-def _axes(width: float = 9.0, height: float = 2.4) -> tuple[Figure, Axes]:
+def _axes(width: float = 10.4, height: float = 2.4) -> tuple[Figure, Axes]:
     figure, axes = plt.subplots(figsize=(width, height), layout="constrained")
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25)
@@ -48,6 +50,8 @@ def loss_curve(steps: Sequence[float], losses: Sequence[float]) -> str:
     """Training loss over fine-tuning steps, logarithmic."""
     figure, axes = _axes()
     axes.semilogy(steps, losses, color=BLUE, lw=1)
+    axes.yaxis.set_major_formatter(LogFormatter())
+    axes.yaxis.set_minor_formatter(LogFormatter())
     axes.set(xlabel="iteration", ylabel="loss")
     return _svg(figure)
 
@@ -69,17 +73,15 @@ def guidance_curve(sweep: Sequence[dict[str, float]], chosen: float) -> str:
     """Diversity against lip synchrony for each guidance scale of the sweep (the paper's figure 3)."""
     figure, axes = _axes(width=5.0, height=3.0)
     axes.plot([row["div_e"] for row in sweep], [row["lip_sync"] for row in sweep], color=GREY, lw=1)
-    for row in sweep:
-        is_chosen = abs(row["s"] - chosen) < 1e-6
-        axes.scatter(
-            row["div_e"], row["lip_sync"], color=GREEN if is_chosen else BLUE, s=40 if is_chosen else 16
-        )
-        axes.annotate(
-            f"{row['s']:.1f}",
-            (row["div_e"], row["lip_sync"]),
-            fontsize=8,
-            xytext=(4, 3),
-            textcoords="offset points",
-        )
+    axes.autoscale_view()  # else places in the plot are not known yet
+    labelled: list[NDArray[np.floating]] = []
+    for row in sorted(sweep, key=lambda row: abs(row["s"] - chosen)):
+        is_chosen = not labelled
+        place = row["div_e"], row["lip_sync"]
+        axes.scatter(*place, color=GREEN if is_chosen else BLUE, s=40 if is_chosen else 16)
+        seen = axes.transData.transform(place)
+        if all(np.abs(seen - other).max() > LABEL_PX for other in labelled):
+            labelled.append(seen)
+            axes.annotate(f"{row['s']:.1f}", place, fontsize=8, xytext=(4, 3), textcoords="offset points")
     axes.set(xlabel="diversity over samples (div_e), mm", ylabel="lip_sync, mm (lower is better)")
     return _svg(figure)

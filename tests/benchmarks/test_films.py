@@ -20,6 +20,7 @@ from tracker.raster import project
 
 SCENE = Scene("tiny", 5, seconds=0.2, head=0.5)
 ROOT = Path(__file__).parents[2]
+MOVING = ("expression", "rotation", "translation", "eyes")
 # What is imported and changes no film: where and how files lie, types, sound, heads of another kind.
 NO_MAKERS = {
     *("model/files.py", "personalize/feature_cache.py", "personalize/files.py", "personalize/sound.py"),
@@ -68,6 +69,15 @@ def test_lips_outside_the_picture_count_as_covered(shift: tuple[float, float, fl
     away = replace(moves, translation=moves.translation + np.float32(shift))
     picture, covered = _Studio(SCENE, person, away).picture(0, person.template)
     assert covered == 1 and picture.shape == (640, 640, 3)
+
+
+def test_no_motion_blurs_across_a_cut() -> None:
+    scene = replace(SCENE, seconds=0.4, shot_s=0.2, noise=0.0, head=1.5)
+    person, moves = furnished(stranger(load_head(), scene)), scene_motion(scene)
+    moves.translation[5:, 0] += 0.05
+    ended = replace(moves, **{name: getattr(moves, name)[:5] for name in MOVING})
+    whole, alone = (_Studio(scene, person, seen).picture(4, person.template)[0] for seen in (moves, ended))
+    np.testing.assert_array_equal(whole, alone)
 
 
 @pytest.mark.parametrize("scene", [s for s in SCENES if s.speaks], ids=lambda scene: scene.name)
