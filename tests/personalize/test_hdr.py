@@ -9,7 +9,7 @@ import av
 import numpy as np
 import pytest
 
-from personalize.hdr import HLG, KNEE, PQ, _hlg, _pq, usual_range
+from personalize.hdr import HLG, KNEE, PQ, ROWS, _hlg, _pq, usual_range
 from personalize.pictures import FrameReader
 
 COLOURS = np.array(  # skin, lips, greys, and the three primaries
@@ -68,6 +68,13 @@ def test_what_is_brighter_than_white_is_told_apart(transfer: int) -> None:
     assert (np.ptp(seen, axis=1) <= 1).all() and (np.diff(seen.astype(int), axis=0) >= 0).all()
     white = np.searchsorted(grey, 65535 * (0.58 if transfer == PQ else 0.75))
     assert seen[0].max() == 0 and 225 < seen[white, 0] < 250 < seen[-1, 0]
+
+
+def test_a_picture_of_many_rows_is_that_of_each() -> None:
+    """Tall pictures are taken some rows at a time."""
+    stored = np.random.default_rng(0).integers(0, 65536, (2 * ROWS + 22, 3, 3)).astype(np.uint16)
+    whole = usual_range(stored, PQ)
+    np.testing.assert_array_equal(whole, np.concatenate([usual_range(row[None], PQ) for row in stored]))
 
 
 @pytest.mark.parametrize("colours_named", [True, False])

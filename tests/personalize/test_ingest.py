@@ -3,25 +3,40 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 
-from personalize.container import probe
+from personalize.container import MediaInfo, probe
 from personalize.errors import UserError
 from personalize.ingest import (
     MIN_USABLE_S,
     _check_upright,
     _form,
+    _lost_in_file,
+    _Seen,
     _without_sound,
     find_usable,
     ingest_video,
 )
-from personalize.people import FaceFollower, Sighting, Tracklet, main_person, sureness_of_turns
+from personalize.people import (
+    OTHER_PERSON,
+    FaceFollower,
+    Look,
+    Sighting,
+    Tracklet,
+    main_person,
+    sharpness,
+    sureness_of_turns,
+)
+from personalize.pictures import FrameReader
 from personalize.shots import (
     REASONS,
     Changes,
@@ -85,7 +100,7 @@ def test_a_missing_second_ends_a_shot_and_a_dropped_frame_does_not() -> None:
     time = np.concatenate([np.arange(25) / 25, 2 + np.arange(25) / 25])
     time = np.delete(time, 40)
     change = np.full(len(time), 1.0)
-    change[40] = 2.2  # two steps at once
+    change[40] = 4.0  # two steps at once
     assert list(np.flatnonzero(np.diff(find_shots(time, change))) + 1) == [25]
 
 
@@ -105,6 +120,12 @@ def test_a_small_face_that_moves_in_a_still_picture_repeats_nothing() -> None:
     (whole, same), (near, alike) = changes.next(moved, face)
     assert same and not alike and near > 10 * whole
     assert changes.next(moved, face) == ((0.0, True), (0.0, True))
+    # What changes elsewhere counts as well: another slide, of which the still face sees nothing.
+    slide = moved.copy()
+    slide[:300, :600] = 255
+    other, (near, alike) = changes.next(slide, face)
+    assert (near, alike) == other and near > 10 and not alike
+    changes.next(moved, face)
     # A large face is a large part of the picture.
     whole_only = changes.next(screen, np.array([200, 100, 900, 700], np.float32))
     assert whole_only[0] == whole_only[1] == (whole, True)
@@ -208,7 +229,12 @@ def test_split_moves_to_a_cut_nearby() -> None:
 
 
 def tracklet(
-    person: int, frames: range, width: float = 50, seed: int = 0, light: float = 120.0, burnt: float = 0.0
+    person: int,
+    frames: Iterable[int],
+    width: float = 50,
+    seed: int = 0,
+    light: float = 120.0,
+    burnt: float = 0.0,
 ) -> Tracklet:
     """A face whose shape and portrait are those of `person`, with some noise and in another pose."""
     own, noise = np.random.default_rng(person), np.random.default_rng(seed + 1000)
@@ -220,7 +246,7 @@ def tracklet(
     )
     box = np.array([0, 0, width, width], np.float32)
     return Tracklet(
-        [Sighting(f, f / 25, box, 60.0, light, burnt, 0.5, None if f % 10 else sample) for f in frames]
+        [Sighting(f, f / 25, box.copy(), 60.0, light, burnt, 0.5, None if f % 10 else sample) for f in frames]
     )
 
 
@@ -452,6 +478,57 @@ def test_behind_a_cut_a_face_is_looked_at_anew_however_shortly_it_is_seen() -> N
     assert len(before.shapes) == 3 and len(behind.shapes) == 1
 
 
+@pytest.mark.parametrize(("gone", "jump_px", "tracklets"), [(10, 0, 1), (11, 0, 2), (0, 50, 1), (0, 120, 2)])
+def test_a_face_that_is_soon_seen_again_nearly_where_it_was_is_the_same(
+    gone: int, jump_px: float, tracklets: int
+) -> None:
+    """Of 200 px; ten pictures are .4 s from the last sight of it."""
+    follower, picture = (
+        FaceFollower(Mock(landmarks=lambda *_: (None, 0.0, None))),
+        np.zeros((480, 640, 3), np.uint8),
+    )
+    for index in range(40):
+        box = np.float32([100, 100, 300, 300]) + np.float32([jump_px, 0, jump_px, 0]) * (index >= 20)
+        seen = [] if 20 <= index < 20 + gone - 1 else [Face(box, np.zeros((6, 2), np.float32), 0.9)]
+        follower._landmarker.detect = lambda *_, seen=seen, **__: seen
+        follower.add(index, index / 25, picture)
+    assert len(follower.tracklets) == tracklets
+
+
+def test_people_are_told_apart_by_the_shape_of_the_face_and_by_how_the_head_looks() -> None:
+    """Either is enough; a pose, a size and other light are not."""
+    one, other = tracklet(1, range(0, 30)), tracklet(2, range(40, 70))
+    pose = np.asarray(one.shapes[0], np.float64)
+
+    def mixed(shape: Tracklet, portrait: Tracklet, light: float = 1.0) -> Look:
+        made = tracklet(1, range(80, 110))
+        turn = np.array([[0.0, -1.3, 0.0], [1.3, 0.0, 0.0], [0.0, 0.0, 1.3]])
+        samples = [(s @ turn, light * p) for s, p in zip(shape.shapes, portrait.portraits)]
+        made.sightings = [replace(made.sightings[0], sample=sample) for sample in samples]
+        return Look.of(made, pose)
+
+    look = Look.of(one, pose)
+    assert look.distance(mixed(one, one, 0.5)) < 0.2
+    assert look.distance(mixed(other, one)) > OTHER_PERSON / 2
+    assert look.distance(mixed(one, other)) > OTHER_PERSON / 2
+    apart = look.distance(mixed(other, one)) + look.distance(mixed(one, other))
+    assert look.distance(mixed(other, other)) == pytest.approx(apart, abs=0.1)
+
+
+def test_of_two_faces_alike_that_are_seen_together_one_is_the_person() -> None:
+    """As in a mirror, or a picture on the wall."""
+    mine = [tracklet(1, range(0, 50)), tracklet(1, range(60, 100), seed=1)]
+    mirrored = tracklet(1, range(60, 90), seed=2, width=30)
+    kept, left = main_person([mirrored, *mine])
+    assert {id(t) for t in kept} == {id(t) for t in mine} and left == [mirrored]
+
+
+def test_how_sharp_a_face_is_does_not_hang_on_its_contrast() -> None:
+    grey = np.random.default_rng(0).integers(0, 255, (64, 64)).astype(np.uint8)
+    assert sharpness(grey // 3 + 90) == pytest.approx(sharpness(grey), rel=0.05)
+    assert sharpness(cv2.GaussianBlur(grey, (0, 0), 2.0)) < 0.2 * sharpness(grey)
+
+
 def test_what_may_be_a_cut_holds_every_cut() -> None:
     random = np.random.default_rng(1)
     for scale in (0.2, 1.0, 4.0):
@@ -494,6 +571,108 @@ def test_what_the_file_lost_is_said(tmp_path: Path) -> None:
     path = write_video(tmp_path / "gap.mkv", moving(20), [i / 25 + (i >= 10) for i in range(20)])
     _, warnings = find_usable(probe(path))
     assert any("1.0 s without pictures in 1 gaps, the first at 0.4 s" in text for text in warnings)
+
+
+def seen_as(faces: list[Tracklet], time: np.ndarray, **marks: np.ndarray) -> _Seen:
+    """What a pass over pictures at `time` [T] s shows where these faces are; marks: as of `_Seen`."""
+    nothing = np.zeros(len(time), bool)
+    reader = SimpleNamespace(resized_s=np.nan, interlaced=0)
+    rest = {"change": np.ones(len(time)), "again": nothing, "corrupt": nothing} | marks
+    return _Seen(time=time, faces=faces, turns=[], reader=cast(FrameReader, reader), **rest)
+
+
+def usable_of(
+    seen: _Seen, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int] = (960, 540)
+) -> tuple[Frames, list[str]]:
+    """`find_usable` of a film of that size (width, height)."""
+    monkeypatch.setattr("personalize.ingest._looked_through", lambda *_: seen)
+    monkeypatch.setattr("personalize.ingest.quantizer", lambda _: np.nan)
+    media = SimpleNamespace(path="film.mp4", width=size[0], height=size[1], duration_s=float(seen.time[-1]))
+    return find_usable(cast(MediaInfo, media))
+
+
+def test_every_frame_is_left_out_for_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cuts at 40, 48 and 80: eight frames are no shot, and behind the last there is somebody else."""
+    time, change = np.arange(100) / 25, np.ones(100)
+    change[[40, 48, 80]] = 20
+    mine = [*range(26), *range(36, 60), *range(62, 80)]
+    spoiled = {
+        "blurred": {"sharpness": 0.19},
+        "too_dark": {"light": 14.0},
+        "too_bright": {"burnt": 0.51},
+        "too_small": {"eyes": 19.0},
+    }
+    at = dict(zip((10, 12, 14, 16), spoiled.items()))
+    faces = [tracklet(1, mine), tracklet(2, range(80, 100))]
+    faces[0].sightings = [
+        replace(one, **at[one.frame][1]) if one.frame in at else one for one in faces[0].sightings
+    ]
+    marks = {
+        name: np.isin(np.arange(100), rows) for name, rows in (("again", (18, 20)), ("corrupt", (20, 30)))
+    }
+    frames, warnings = usable_of(seen_as(faces, time, change=change, **marks), monkeypatch)
+    expected = np.full(100, "ok", object)
+    for frame, (name, _) in at.items():
+        expected[frame] = name
+    expected[26:36] = "no_face"  # for more than .3 s; 60 and 61 are taken to be like their neighbours
+    expected[[18, 20, 30]] = "duplicate", "corrupt", "corrupt"
+    expected[40:49], expected[80:] = "cut", "other_person"
+    assert [frames.reasons[index] for index in frames.reason] == expected.tolist()
+    np.testing.assert_array_equal(frames.usable, expected == "ok")
+    np.testing.assert_array_equal(
+        np.isnan(frames.box[:, 0]), np.isin(np.arange(100), [*range(26, 36), *range(80, 100)])
+    )
+    assert any("2.0% of 100 frames left out: damaged" in text for text in warnings)  # however few
+    assert any("20.0% of 100 frames left out: another person" in text for text in warnings)
+    assert not any("repeated" in text for text in warnings)
+
+
+def test_what_the_detector_missed_for_a_moment_lies_between_its_neighbours(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    face = tracklet(1, [*range(20), 22, *range(23, 40), 50])
+    for sighting in face.sightings:
+        sighting.box[:] = np.float32([0, 0, 50, 50]) + sighting.frame
+    frames, _ = usable_of(seen_as([face], np.arange(51) / 25), monkeypatch)
+    np.testing.assert_allclose(frames.box[20:22, 0], [20, 21])
+    assert np.isnan(frames.box[40:50]).all() and frames.box[50, 0] == 50
+
+
+@pytest.mark.parametrize(
+    ("eyes", "reason", "said"), [(15.0, "ok", "30 px"), (9.0, "too_small", ""), (30.0, "ok", "")]
+)
+def test_faces_are_measured_in_the_films_own_pixels(
+    monkeypatch: pytest.MonkeyPatch, eyes: float, reason: str, said: str
+) -> None:
+    """They are looked for in smaller pictures."""
+    face = tracklet(1, range(40))
+    face.sightings = [replace(one, eyes=eyes) for one in face.sightings]
+    frames, warnings = usable_of(seen_as([face], np.arange(40) / 25), monkeypatch, (1080, 1920))
+    assert {frames.reasons[index] for index in frames.reason} == {reason}
+    np.testing.assert_allclose(frames.box[5], [0, 0, 100, 100])
+    assert any(f"small ({said} between the eyes)" in text for text in warnings) == bool(said)
+
+
+@pytest.mark.parametrize(("seconds", "said"), [(8, "refused"), (20, "only 20.0 s of usable face"), (40, "")])
+def test_how_much_usable_face_there_is_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: int, said: str
+) -> None:
+    path = write_video(tmp_path / "clip.mkv", moving(20), [i / 25 for i in range(20)], clicks([0.2], 1))
+    frames = frames_of(np.arange(25 * seconds) / 25, np.ones(25 * seconds, bool))
+    monkeypatch.setattr("personalize.ingest.find_usable", lambda media, progress: (frames, []))
+    if said == "refused":
+        with pytest.raises(UserError, match=r"only 8\.0 s of usable face, at least 10 s are needed"):
+            ingest_video(path)
+        return
+    ingested = ingest_video(path)
+    assert len(ingested.audio) == 16_000 * seconds  # to the end of the last picture
+    assert (said in ingested.warnings[0]) if said else not any("usable" in text for text in ingested.warnings)
+
+
+def test_a_file_that_breaks_off_is_told() -> None:
+    media = cast(MediaInfo, SimpleNamespace(duration_s=5.0))
+    assert _lost_in_file(media, np.arange(101) / 25) == []
+    assert _lost_in_file(media, np.arange(76) / 25) == ["the file breaks off at 3.0 s of 5.0 s"]
 
 
 SHARED = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[3] / "shared")) / "data/videos"

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from av.sidedata.sidedata import Type as SideData
 
-from personalize.container import _quantizer, probe, quantizer
+from personalize.container import _duration, _prominence, _quantizer, probe, quantizer
 from personalize.errors import UserError
 from personalize.pictures import FrameReader, _ahead, _in_time, _turned
 from personalize.sound import on_video_clock, read_audio, write_wav
@@ -320,6 +320,83 @@ def test_damaged_pictures_are_named_until_the_next_key(tmp_path: Path) -> None:
     assert len(damaged) >= 20 and not damaged[0]
     assert any(damaged) or len(damaged) < 40
     assert not damaged[-1]
+
+
+@pytest.mark.parametrize(
+    ("step_s", "keys", "damaged"),
+    [(0.04, (0, 20), range(10, 20)), (1.0, (0, 20), range(10, 16)), (1.0, (0, 12), range(10, 12))],
+)
+def test_damage_lasts_until_the_next_key_and_five_seconds_at_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step_s: float, keys: tuple[int, ...], damaged: range
+) -> None:
+    path = write_video(tmp_path / "v.mkv", moving(3), STEADY[:3])
+    frames = [
+        SimpleNamespace(
+            width=96, height=64, side_data=[], interlaced_frame=False, is_corrupt=n == 10, key_frame=n in keys
+        )
+        for n in range(30)
+    ]
+    monkeypatch.setattr(
+        "personalize.pictures._in_time", lambda *_: ((step_s * n, f) for n, f in enumerate(frames))
+    )
+    monkeypatch.setattr(FrameReader, "_to_rgb", lambda *_: corner_picture())
+    reader = FrameReader(path)
+    assert [n for n, _ in enumerate(reader) if reader.damaged] == list(damaged)
+
+
+def test_a_film_beyond_the_limit_is_refused_whatever_its_container_says(tmp_path: Path) -> None:
+    frames = [SimpleNamespace(pts=pts, time_base=Fraction(1)) for pts in (0, 1, 4 * 3600 + 1)]
+    with pytest.raises(UserError, match="over 4 h long"):
+        list(_in_time(frames, 0.0, 0.04, tmp_path))
+    long = SimpleNamespace(duration=4 * 3600 + 1, time_base=Fraction(1))
+    with pytest.raises(UserError, match=r"4\.0 h long; cut it to under 4 h"):
+        _duration(tmp_path, SimpleNamespace(video=long))
+
+
+def test_pictures_that_are_far_too_large_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_video(tmp_path / "v.mkv", moving(2), STEADY[:2])
+    monkeypatch.setattr("personalize.container.MAX_SIDE_PX", 95)
+    with pytest.raises(UserError, match="96x64 px; scale it to at most 95 px a side"):
+        probe(path)
+
+
+def test_of_several_pictures_the_one_that_players_show_is_taken_or_the_largest() -> None:
+    none, shown = av.stream.Disposition(0), av.stream.Disposition.default
+    streams = [
+        SimpleNamespace(disposition=flag, width=width, height=64)
+        for flag, width in ((none, 96), (none, 200), (shown, 32), (shown, 48))
+    ]
+    assert max(streams, key=_prominence) is streams[3]
+    assert max(streams[:2], key=_prominence) is streams[1]
+
+
+def test_smaller_pictures_are_averaged_and_not_sampled(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (64, 96, 1), dtype=np.uint8).repeat(3, 2)
+    path = write_video(tmp_path / "v.mkv", [noise] * 2, STEADY[:2])
+    _, small = next(FrameReader(path, max_side=24))
+    blocks = noise[..., 0].reshape(16, 4, 24, 4).mean((1, 3))
+    assert np.abs(small[..., 0] - blocks).mean() < 5
+
+
+@pytest.mark.parametrize(("height", "red"), [(720, 63), (704, 81)])
+def test_colours_that_are_not_named_are_those_of_hd_where_it_is_hd(
+    tmp_path: Path, height: int, red: int
+) -> None:
+    """Pure red, as BT.709 and BT.601 store it: Y of 63 or 81, and blue and red beside it."""
+    blue = {63: 102, 81: 90}[red]
+    path = tmp_path / "v.mkv"
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("libx264", rate=25, options={"crf": "4"})
+        stream.width, stream.height, stream.pix_fmt = 32, height, "yuv420p"
+        for index in range(2):
+            frame = av.VideoFrame(32, height, "yuv420p")
+            for plane, level in zip(frame.planes, (red, blue, 240)):
+                plane.update(bytes([level]) * plane.buffer_size)
+            frame.pts, frame.time_base = index, Fraction(1, 25)
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    _, picture = next(FrameReader(path))
+    np.testing.assert_allclose(picture[height // 2, 16], [255, 0, 0], atol=4)
 
 
 def _still(path: Path) -> Path:

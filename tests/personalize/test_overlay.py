@@ -14,6 +14,7 @@ from personalize.quality import write_quality
 from personalize.render.track import BAD, FOOTER, GOOD, PANEL, TILE, TrackPictures, around_face, grid
 from personalize.run import RunFolder, write_landmarks, write_track
 from personalize.settings import Settings
+from personalize.sound import read_audio
 from personalize.stages import Overlay
 from tests.personalize.video_factory import clicks, write_video
 from tests.tracker.turning_head import picture, shifted_landmarks, turning_track
@@ -124,6 +125,22 @@ def test_the_film_shows_every_frame_in_every_mode_and_what_is_left_out(
     sheet = cv2.imread(str(folder / "contact_sheet.png"))
     places = len(notable_frames(np.arange(FRAMES) != LEFT_OUT, np.ones(FRAMES)))
     assert sheet.shape == (-(-places // COLUMNS) * TILE, COLUMNS * TILE, 3)
+
+
+def test_the_preview_is_the_beginning_and_the_sheet_shows_its_frames_in_their_colours(
+    run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("personalize.overlay.PREVIEW_S", 0.1)
+    folder = make(run, tmp_path / "made", ("shaded",))
+    whole, preview = ([t for t, _ in FrameReader(folder / f"{name}.mp4")] for name in ("overlay", "preview"))
+    assert whole == pytest.approx(np.arange(FRAMES) / 25, abs=1e-3) and preview == pytest.approx(whole[:3])
+    lengths = [len(read_audio(folder / f"{name}.mp4")[0]) / 16_000 for name in ("overlay", "preview")]
+    assert lengths == pytest.approx([FRAMES / 25, 0.1], abs=0.05)  # sound is coded in blocks
+    pictures, valid = TrackPictures.of(run, load_head(), ("shaded",)), np.arange(FRAMES) != LEFT_OUT
+    frame = int(notable_frames(valid, np.ones(FRAMES, np.float32))[0])
+    _, rgb = list(FrameReader(run.video))[frame]
+    sheet = cv2.cvtColor(cv2.imread(str(folder / "contact_sheet.png")), cv2.COLOR_BGR2RGB)
+    np.testing.assert_array_equal(sheet[:TILE, :TILE], pictures.tile(rgb, frame))
 
 
 def test_the_same_film_is_made_twice(run: RunFolder, tmp_path: Path) -> None:

@@ -7,10 +7,11 @@ from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from personalize.evaluation.report import _apart
 from personalize.pipeline import STAGES
-from personalize.quality import frame_reasons, left_out, read_reasons, write_quality
+from personalize.quality import frame_reasons, head_angles, left_out, read_reasons, write_quality
 from personalize.run import write_refined
 from personalize.shots import REASONS, Frames
 from personalize.stages import Refine
@@ -97,3 +98,29 @@ def test_cuts_have_no_row_of_their_own_in_the_report():
     told, cuts = _apart(spans)
     assert [span.reason for span in told] == ["occluded", "no_face"]
     assert sum(cut.end_s - cut.start_s for cut in cuts) == pytest.approx(0.08)
+
+
+FACING = Rotation.from_matrix(
+    np.diag([1.0, -1.0, -1.0])
+)  # x of the picture is the subject's left, its y is down
+
+
+@pytest.mark.parametrize(
+    ("yaw", "pitch", "roll"), [(0, 0, 0), (30, 0, 0), (0, 20, 0), (0, 0, 10), (-40, -25, 15)]
+)
+def test_angles_of_the_head_are_signed_as_they_say(track, tmp_path: Path, yaw: int, pitch: int, roll: int):
+    """By where nose and crown point: the head leans, then goes back about its own ears' axis, then turns."""
+    one = np.radians([yaw, pitch, roll])
+    nose = [np.sin(one[0]) * np.cos(one[1]), -np.sin(one[1]), -np.cos(one[0]) * np.cos(one[1])]
+    level = np.array([np.cos(one[0]), 0, np.sin(one[0])])  # to the left ear of a head that does not lean
+    crown = np.cos(one[2]) * np.cross(nose, level) + np.sin(one[2]) * level
+    head = np.column_stack([np.cross(crown, nose), crown, nose])
+    rotation = Rotation.from_matrix(head).as_rotvec().astype(np.float32)
+    np.testing.assert_allclose(head_angles(rotation[None])[0], [yaw, pitch, roll], atol=1e-3)
+    # The table counts what a neck turns as well.
+    neck = (FACING.inv() * Rotation.from_matrix(head)).as_rotvec().astype(np.float32)
+    still = replace(track, rotation=np.tile(FACING.as_rotvec(), (6, 1)), neck=np.tile(neck, (6, 1)))
+    write_quality(tmp_path / "quality.csv", still, ["ok"] * 6, np.ones(6, np.float32))
+    row = next(csv.DictReader((tmp_path / "quality.csv").open(newline="")))
+    told = [float(row[f"{name}_deg"]) for name in ("yaw", "pitch", "roll")]
+    np.testing.assert_allclose(told, [yaw, pitch, roll], atol=0.01)

@@ -86,6 +86,10 @@ def test_the_focal_length_is_read(
     ("kind", "value"),
     [
         *[(UNSIGNED, b"\x00"), (SIGNED, b"\xff"), (FLOAT, struct.pack(">f", float("nan"))), (FLOAT, b"\x00")],
+        *[
+            (UNSIGNED, b"\x05"),
+            (DOUBLE, struct.pack(">d", 401)),
+        ],  # of the lens itself, not as on film; a telescope's
         *[(TEXT, b"wide"), (TEXT, b""), (UNSIGNED, b"\xff" * 300), (99, b"\x1a")],
     ],
 )
@@ -121,3 +125,24 @@ def test_what_a_broken_track_does_not_tell_the_movie_may(film: Path) -> None:
 def test_a_file_of_nothing_but_boxes_is_soon_given_up(film: Path) -> None:
     path = with_metadata(film, "many.mp4", [b"moov"], box(b"free") * 200_000, metadata(UNSIGNED, b"\x1a"))
     assert recorded_focal_mm(path) == 0
+
+
+def test_the_picture_tracks_lens_counts_before_the_movies(film: Path) -> None:
+    path = with_metadata(film, "both.mp4", [b"moov", b"trak"], metadata(UNSIGNED, b"\x1a"))
+    path.write_bytes(inside(path.read_bytes(), [b"moov"], metadata(UNSIGNED, b"\x1c")))
+    assert recorded_focal_mm(path) == 26
+
+
+def test_boxes_of_64_bits_are_read_as_others_are(film: Path) -> None:
+    """Telephones write them where a film may grow beyond 4 GB."""
+    held = metadata(UNSIGNED, b"\x1a")
+    long = struct.pack(">I4sQ", 1, b"meta", len(held) + 8) + held[8:]
+    path = with_metadata(film, "long.mp4", [b"moov", b"trak"], long)
+    path.write_bytes(struct.pack(">I4sQ", 1, b"free", 24) + bytes(8) + path.read_bytes())
+    assert recorded_focal_mm(path) == 26
+
+
+def test_metadata_of_more_than_a_megabyte_are_not_looked_through(film: Path) -> None:
+    long = metadata(UNSIGNED, b"\x1a")
+    long = box(b"meta", long[8:], box(b"free", bytes(1 << 20)))
+    assert recorded_focal_mm(with_metadata(film, "fat.mp4", [b"moov", b"trak"], long)) == 0

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import tracker.camera as subject
 from tracker import feature_tracks
+from tracker.bundle_adjustment import RigidScene
 from tracker.camera import PRIOR_FOCAL, PRIOR_SD_LOG, estimate_camera
 from tracker.feature_tracks import (
     FeatureFollower,
@@ -19,6 +20,7 @@ from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import LEFT_EYE, POINTS, RIGHT_EYE, UPPER_FACE
 from tracker.patch_registration import fine_texture
 from tracker.raster import project
+from tracker.rigid_surface import SurfacePoints
 from tracker.track import F64, Landmarks
 
 SIZE, FOCAL = (640, 480), 1100.0
@@ -118,6 +120,59 @@ def test_what_the_camera_wrote_of_its_lens_is_the_prior(head: HeadModel) -> None
     assert abs(np.log(camera.focal_px / FOCAL)) < 0.085 < np.log(1.1)
     camera, _ = estimate_camera(marks, tracks, head, focal_given=1000.0, recorded_mm=wrote)
     assert (camera.method, camera.focal_px) == ("given", 1000.0)
+
+
+@pytest.mark.parametrize(
+    ("focal", "sd_log", "turn_deg", "expected_sd"),
+    [
+        (1.0, 0.1, 5.0, np.hypot(0.1, 0.08)),  # what light and moving skin do is never told by tracks
+        (1.0, 0.0, 5.0, 0.08),
+        (0.61, 0.1, 5.0, np.hypot(0.1, 0.08)),
+        (4.9, 0.1, 5.0, np.hypot(0.1, 0.08)),
+        (0.59, 0.1, 5.0, None),  # no camera
+        (5.1, 0.1, 5.0, None),
+        (1.0, 0.26, 5.0, np.hypot(0.26, 0.08)),
+        (1.0, 0.28, 5.0, None),  # more than .28, beside what is never told
+        (1.0, 0.1, 3.5, None),  # to either side: less than 8 degrees
+    ],
+)
+def test_what_a_clip_must_tell_to_be_believed(
+    focal: float, sd_log: float, turn_deg: float, expected_sd: float | None
+) -> None:
+    prior = subject._camera(SIZE, None, (), 0.0)
+    angle = np.radians(turn_deg) * np.sin(np.linspace(0, 4 * np.pi, 200))
+    rotation = Rotation.from_rotvec(np.outer(angle, [0, 1, 0])).as_matrix() @ FACING
+    scene = RigidScene(
+        np.arange(200), rotation, np.tile([0, 0, 0.6], (200, 1)), np.zeros((0, 3)), np.zeros((0, 4))
+    )
+    told = subject._told(prior, scene, 640 * focal, sd_log)
+    if expected_sd is None:
+        assert told == prior
+    else:
+        assert (told.method, told.focal_px) == ("bundle", 640 * focal)
+        assert told.focal_sd_log == pytest.approx(expected_sd)
+    given = subject._camera(SIZE, 900.0, (), 0.0)
+    assert subject._told(given, scene, 640 * focal, sd_log) == given
+
+
+def test_the_bundle_lies_on_the_mean_head_as_it_is_seen() -> None:
+    """Turned, moved and scaled as a whole, its places in the pictures stay; points that are far off say nothing."""
+    random = np.random.default_rng(4)
+    points, turn = random.normal(0, 0.03, (60, 3)), Rotation.from_rotvec([0.1, -0.2, 0.05])
+    loose = 1.2 * turn.apply(points) + [0.01, 0.02, -0.03]
+    loose[:6] += random.normal(0, 0.2, (6, 3))  # of short tracks
+    rotation = Rotation.from_rotvec(random.normal(0, 0.2, (9, 3))).as_matrix() @ FACING
+    shift = np.array([0, 0, 0.7]) + random.normal(0, 0.02, (9, 3))
+    scene = RigidScene(np.arange(9), rotation, shift, loose, np.zeros((0, 4)))
+    surface = SurfacePoints(points, np.zeros((60, 3, 0)), np.tile(np.eye(3), (60, 1, 1)), np.zeros(60))
+    settled = subject._settled(scene, surface)
+    np.testing.assert_allclose(settled.points[6:], points[6:], atol=1e-9)
+
+    def seen(scene: RigidScene) -> np.ndarray:
+        camera = np.einsum("mij,qj->mqi", scene.rotation, scene.points) + scene.translation[:, None]
+        return project(camera, FOCAL, CENTRE)
+
+    np.testing.assert_allclose(seen(settled), seen(scene), atol=1e-6)
 
 
 def test_a_given_lens_is_taken_out(head: HeadModel) -> None:

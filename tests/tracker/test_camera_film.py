@@ -302,6 +302,71 @@ def test_the_adjustment_s_derivatives_are_those_of_its_residuals():
     assert np.allclose(1e6 * analytic, numeric, rtol=1e-4, atol=1e-2)
 
 
+def test_a_step_of_the_adjustment_is_that_of_all_unknowns_together_and_goes_down_the_cost():
+    """Against one dense system in which nothing is eliminated, whose slope is the cost's by finite differences."""
+    rng, (frames, count, shapes) = np.random.default_rng(7), (5, 12, 2)
+    points = rng.normal(0, 0.03, (count, 3))
+    rotation = Rotation.from_rotvec(rng.normal(0, 0.2, (frames, 3))).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    translation = np.array([0, 0, DISTANCE]) + rng.normal(0, 0.01, (frames, 3))
+    frame, point = (index.ravel() for index in np.mgrid[:frames, :count])
+    kept = rng.random(len(frame)) < 0.8
+    seen = np.einsum("oij,oj->oi", rotation[frame], points[point]) + translation[frame]
+    xy = project(seen, FOCAL, PRINCIPAL) + rng.normal(0, 1.0, (len(frame), 2))
+    observations = np.column_stack([frame, point, xy])[kept]
+    root = rng.normal(size=(count, 3, 3))
+    precision = (root @ root.transpose(0, 2, 1) + np.eye(3)) / 0.002**2
+    modes = 0.003 * rng.normal(size=(count, 3, shapes))
+    surface = SurfacePoints(points, modes, precision, moving=rng.uniform(0, 0.001, count))
+    scene_ = RigidScene(np.arange(frames, dtype=np.int32), rotation, translation, points, observations)
+    problem = _Problem(scene_, surface, np.array(PRINCIPAL), FOCAL, 0.3)
+    state = _State(
+        np.log(1.1 * FOCAL), rng.normal(size=shapes), rng.normal(0, 0.002, (count, 3)), rotation, translation
+    )
+    problem.let_go(0.0, state)
+
+    def moved(change: NDArray[np.float64]) -> _State:
+        longer, shape, off, turn, shift = np.split(change, np.cumsum([1, shapes, 3 * count, 3 * frames]))
+        turned = Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix() @ rotation
+        return _State(
+            state.log_focal + longer[0],
+            state.shape + shape,
+            state.departure + off.reshape(-1, 3),
+            turned,
+            translation + shift.reshape(-1, 3),
+        )
+
+    unknowns = 1 + shapes + 3 * count + 6 * frames
+    steps = 1e-6 * np.eye(unknowns)
+    slope = np.array([(problem._cost(moved(h)) - problem._cost(moved(-h))) / 4e-6 for h in steps])
+    rows = np.stack(
+        [(problem._residuals(moved(h))[0] - problem._residuals(moved(-h))[0]) / 2e-6 for h in steps]
+    )
+    residual = problem._residuals(state)[0]
+    variance = problem._repeats * problem._noise**2 * (1 + (residual**2).sum(1) / (2 * problem._noise) ** 2)
+    dense = np.einsum("uok,o,vok->uv", rows, 1 / variance, rows)
+    dense[0, 0] += 0.3**-2
+    dense[range(1, 1 + shapes), range(1, 1 + shapes)] += 1
+    believed = 1 / (1 + np.einsum("qi,qij,qj->q", state.departure, precision, state.departure) / 3.0**2)
+    for q in range(count):
+        own = slice(1 + shapes + 3 * q, 4 + shapes + 3 * q)
+        dense[own, own] += believed[q] * precision[q]
+    expected, found = moved(-np.linalg.solve(dense, slope)), problem._step(state, 0.0)
+    assert abs(expected.log_focal - state.log_focal) > 0.02
+    for name in ("log_focal", "shape", "departure", "rotation", "translation"):
+        before, there, here = (getattr(one, name) for one in (state, expected, found))
+        np.testing.assert_allclose(here, there, atol=1e-3 * np.abs(there - before).max(), err_msg=name)
+    assert problem.focal_sd_log(state) == pytest.approx(np.sqrt(np.linalg.inv(dense)[0, 0]), rel=1e-4)
+
+
+def test_tracks_count_and_not_how_often_each_is_seen():
+    """An error of a track stays from frame to frame: twice as many frames tell the focal length no better."""
+    true, surface = scene(0.3)
+    rows = true.observations[:, 0] % 2 == 0
+    half = replace(true.select(np.arange(0, COUNT, 2)), observations=true.observations[rows])
+    sds = [adjust(some, surface, PRINCIPAL, FOCAL, PRIOR_SD_LOG)[2] for some in (true, half)]
+    assert sds[1] == pytest.approx(sds[0], rel=0.25)
+
+
 def test_patches_are_found_turned_stretched_and_under_another_light():
     rng = np.random.default_rng(0)
     picture = gaussian_filter(rng.standard_normal((200, 200)), 1.2)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.personalize.test_registration import track_of
-from tracker.confidence import judge, off_axis_deg
+from tracker.confidence import confidence, judge, off_axis_deg
 from tracker.head import load_head
 from tracker.occlusion import Appearance
 
@@ -67,3 +67,14 @@ def test_a_face_at_the_side_of_the_picture_that_looks_at_the_camera_is_not_turne
 def test_a_head_that_its_neck_turns_is_turned_away(track):
     turned = replace(track, neck=np.tile(np.radians([0.0, 60.0, 0.0]).astype(np.float32), (4, 1)))
     assert off_axis_deg(turned) == pytest.approx(off_axis_deg(track) + 60, abs=3)
+
+
+def test_landmarks_cost_what_is_unusual_what_jumps_and_what_is_hidden():
+    error, visible, presence = np.ones((10, 4)), np.ones((10, 4)), np.ones(10)
+    error[0], error[3], error[6:8] = 2, 4, 3  # the first frame has one neighbour, the third stands alone
+    error[:, 3], visible[:, 3] = 100, 0  # what is hidden errs as it likes
+    visible[9], presence[8] = [1, 0.2, 0, 0], 0.9
+    found = confidence(error, visible, presence, np.arange(10) + 1, 12)
+    expected = np.exp(-np.array([0.5, 0, 0, 2.5 + 3, 0, 0, 1.5, 1.5, 0, 0])) * presence
+    expected[9] *= 0.5
+    np.testing.assert_allclose(found, [0, *expected, 0], rtol=1e-6)

@@ -3,18 +3,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.flame_factory import FakeFlame
+from tests.tracker.test_flame import arrays, surface
 from tracker.energy import (
     FACING,
+    LID_PAIRS,
+    LIP_PAIRS,
     Energy,
     LandmarkModel,
     Weights,
+    landmark_model,
     left_jacobian,
     rotation_axis_angle,
     rotation_matrix,
     rotation_vector,
     visibility,
 )
-from tracker.modes import Modes
+from tracker.flame import flame_head
+from tracker.head import load_head
+from tracker.modes import Modes, head_modes
 
 IDENTITIES, EXPRESSIONS, POINTS = 4, 5, 30
 
@@ -174,3 +181,75 @@ def test_skin_turned_away_counts_little():
     assert (seen[0] == 1).all()
     assert (seen[1] == seen[1].min()).all()
     assert 0 < seen[1].min() < 0.1
+
+
+def test_the_energy_is_the_sum_of_its_parts():
+    """Each as it is written, landmark by landmark; lengths in standard deviations."""
+    energy, x = random_energy(2)
+    model, weights = energy.model, energy.weights
+    expected = np.zeros(2)
+    for frame in range(2):
+        w, turn, shift = (
+            x[frame, :EXPRESSIONS],
+            rotation_matrix(x[frame : frame + 1, -6:-3])[0],
+            x[frame, -3:],
+        )
+        face = model.mean + sum(weight * move for weight, move in zip(w, model.expression))
+        seen = face @ turn.T + shift
+        apart = energy.focal * seen[:, :2] / seen[:, 2:] + energy.principal - energy.observed[frame]
+        mm = 1e3 / energy.px_per_m[frame]
+        terms = [(mm * away / weights.noise_mm, share) for away, share in zip(apart, energy.visible[frame])]
+        for upper, lower in model.pairs:  # a pair is seen no better than its worse half
+            share = min(energy.visible[frame, upper], energy.visible[frame, lower])
+            terms.append((mm * (apart[upper] - apart[lower]) / weights.pair_noise_mm, share))
+        for away, share in terms:
+            loss = weights.robust**2 * np.log(1 + away @ away / weights.robust**2)
+            expected[frame] += 0.5 * weights.evidence * share * loss
+        expected[frame] += energy.strictness[frame] * (
+            model.modes.rate @ w + 0.5 * model.modes.precision @ w**2
+        )
+        for (upper, lower), touch in zip(model.pairs, model.touch):
+            through = 1e3 * min(face[upper, 1] - face[lower, 1] - touch, 0) / weights.contact_mm
+            expected[frame] += 0.5 * through**2
+    np.testing.assert_allclose(energy.value(model.mean, x), expected)
+
+
+def test_the_heads_landmarks_are_those_that_stay_on_its_skin_and_shut_where_lids_and_lips_meet():
+    head = load_head()
+    model = landmark_model(head, Weights())
+    assert not np.isin(model.landmarks, [*range(468, 478), 234, 454, 93, 323, 127, 356]).any()
+    assert len(model.landmarks) > 300
+    assert {tuple(pair) for pair in model.landmarks[model.pairs].tolist()} == {*LIP_PAIRS, *LID_PAIRS}
+    blinking = np.array([name.startswith("eyeBlink") for name in head.expression_names], np.float32)
+    shut = head.landmark_positions(np.zeros(len(head.identity_basis)), blinking)
+    y = dict(zip(head.landmark_embedding.landmarks.tolist(), shut[:, 1].tolist()))
+    meet = [y[upper] - y[lower] for upper, lower in model.landmarks[model.pairs].tolist()]
+    np.testing.assert_allclose(model.touch, meet, atol=1e-6)
+
+
+def test_each_shape_has_its_bounds_and_its_prior():
+    head, weights = load_head(), Weights()
+    modes, names = head_modes(head, weights), list(head.expression_names)
+
+    def of(name: str) -> tuple[float, float, float, float]:
+        k = names.index(name)
+        return tuple(float(values[k]) for values in (modes.lower, modes.upper, modes.rate, modes.precision))
+
+    assert of("jawOpen") == of("eyeBlinkLeft") == of("mouthClose") == (0, 1, 2, 4)
+    assert of("jawForward") == of("mouthLeft") == of("cheekPuff") == (0, 1, 50, 4)
+    assert of("lipUpper2") == of("lipLower3") == (-1, 1, 0, pytest.approx(0.6**-2))
+    # A shut mouth under an open jaw: mouthClose never exceeds jawOpen.
+    expression, _ = modes.head_weights(np.eye(len(modes))[names.index("mouthClose")])
+    assert {names[k] for k in np.flatnonzero(expression)} == {"mouthClose", "jawOpen"}
+
+
+def test_a_jaw_joint_has_its_prior_in_its_angles():
+    fake = FakeFlame()
+    modes = head_modes(flame_head("flame", arrays(fake), surface(fake), {}), Weights())
+    for row, sd in ((-2, 0.2), (-1, 0.02)):
+        _, jaw = modes.head_weights(np.eye(len(modes))[row])
+        assert np.count_nonzero(jaw) == 1
+        assert modes.precision[row] == pytest.approx((jaw.max() / sd) ** 2) and modes.rate[row] == 0
+    widest = modes.head_weights(np.eye(len(modes))[-2] * modes.upper[-2])[1]
+    np.testing.assert_allclose(widest, [0.7, 0, 0])
+    assert (modes.precision[:-2] == 1).all() and np.isinf(modes.lower[:-2]).all()

@@ -12,6 +12,7 @@ from tracker.fit import fit_track, make_track, resume, runs, with_lips_shut
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, INNER_LIP_LOWER, POINTS
 from tracker.modes import LIP_SHAPES
+from tracker.scene import place
 from tracker.track import Camera, Landmarks, TrackError
 
 HEAD = load_head()
@@ -242,6 +243,27 @@ def test_a_mouth_that_opens_in_another_profile_is_followed(monkeypatch):
     assert followed < 0.5 * held
 
 
+def test_a_frame_in_which_the_landmarker_hardly_sees_a_face_is_not_measured():
+    talker = Talker(4)
+    presence = np.float32([1, 0.49, 0.5, 1])
+    track = talker.fit(landmarks=replace(talker.landmarks, presence=presence))
+    assert track.valid.tolist() == [True, False, True, True] and track.confidence[1] == 0
+    assert track.confidence[2] < 0.6 * track.confidence[0]
+
+
+def test_reprojection_is_the_mean_distance_of_the_landmarks_that_are_fitted(talker, track):
+    fitted = landmark_model(HEAD, Weights()).landmarks
+    rows = np.isin(HEAD.landmark_embedding.landmarks, fitted)
+    for frame in (0, 77):
+        at = place(track, frame, HEAD)[1][rows]
+        pixels = FOCAL * at[:, :2] / at[:, 2:] + [639.5, 359.5]
+        seen = talker.landmarks.points[frame, HEAD.landmark_embedding.landmarks[rows], :2]
+        apart = np.linalg.norm(pixels - seen, axis=1)
+        # But for how far apart the landmarker holds shut lips, which is taken out.
+        assert track.reprojection_px[frame] == pytest.approx(apart.mean(), rel=0.02)
+        assert apart.max() > 2 * apart.mean()
+
+
 def test_gaze_follows_the_irises(talker, track):
     open_eyes = talker.expression[:, NAMES.index("eyeBlinkLeft")] < 0.1
     for side in range(2):
@@ -330,21 +352,32 @@ def test_a_frame_with_wild_landmarks_is_not_trusted(talker):
     assert np.median(track.confidence) > 0.8
 
 
-def test_a_covered_face_does_not_bend_the_frames_beside_it():
-    """Behind a hand the landmarker holds another face: here one that leans by 10 degrees, its mouth open."""
-    talker = Talker(90)
-    covered = slice(40, 70)
-    points = talker.landmarks.points.copy()
+def leaning(talker: Talker, covered: slice, deg: float) -> tuple[Landmarks, np.ndarray]:
+    """Behind a hand the landmarker holds another face: one that leans, its mouth open; and what evidence there is."""
+    points, evidence = talker.landmarks.points.copy(), np.ones(len(talker.landmarks.time), np.float32)
     points[covered, list(INNER_LIP_LOWER), 1] += np.float32(20)
     middle = points[covered].mean(1, keepdims=True)[..., :2]
-    lean = Rotation.from_euler("z", 10, degrees=True).as_matrix()[:2, :2].astype(np.float32)
+    lean = Rotation.from_euler("z", deg, degrees=True).as_matrix()[:2, :2].astype(np.float32)
     points[covered, :, :2] = (points[covered, :, :2] - middle) @ lean.T + middle
-    evidence = np.ones(90, np.float32)
     evidence[covered] = 0
-    track = talker.fit(landmarks=replace(talker.landmarks, points=points), evidence=evidence)
+    return replace(talker.landmarks, points=points), evidence
+
+
+def test_a_covered_face_does_not_bend_the_frames_beside_it():
+    talker, covered = Talker(90), slice(40, 70)
+    landmarks, evidence = leaning(talker, covered, 10)
+    track = talker.fit(landmarks=landmarks, evidence=evidence)
     assert track.valid.all()
     error = turn_error_deg(track, talker.rotation)
     assert error[[39, 70]].max() < 1.5 * error[:30].max()
+
+
+def test_a_covered_frame_lies_between_its_neighbours():
+    talker = Talker(20)
+    landmarks, evidence = leaning(talker, slice(12, 13), 10)
+    seen, told = (talker.fit(landmarks=landmarks, evidence=given) for given in (None, evidence))
+    assert turn_error_deg(seen, talker.rotation)[12] > 8
+    assert turn_error_deg(told, talker.rotation)[12] < 2
 
 
 def test_the_fit_recovers_within_three_frames_of_a_fast_turn():

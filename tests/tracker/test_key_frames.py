@@ -1,9 +1,13 @@
 """Which frames tell who it is, on generated talkers."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.tracker.test_fit import DISTANCE, FOCAL, NAMES, Talker
+from tests.tracker.test_fit import CAMERA, DISTANCE, FOCAL, HEAD, NAMES, Talker
+from tracker.fit import at_ease, resume
 from tracker.key_frames import KEY_FRAMES, KeyFrames, farthest, key_frames
 
 
@@ -75,3 +79,17 @@ def test_key_frames_of_some_rows():
     assert keys.of(rows).rows.tolist() == [10, 30, 20, 40]
     some = keys.of(rows).among(np.array([30, 40, 99]))
     assert (some.rest.tolist(), some.other.tolist(), some.ease.tolist()) == ([30], [40], [1.0])
+
+
+@pytest.mark.parametrize(("frames", "keys"), [(10, 10), (30, 16), (96, 32), (200, KEY_FRAMES)])
+def test_of_a_short_clip_a_third_is_chosen_and_sixteen_at_least(frames: int, keys: int):
+    found = chosen(Talker(frames))
+    assert len(found.rows) == keys and len(found.rest) == min(keys // 2, max(1, frames // 5))
+
+
+def test_expressions_are_held_where_a_face_rests_as_far_as_it_is_at_ease():
+    keys = KeyFrames(np.array([4, 5, 6]), np.array([7, 8]), np.array([0.0, 0.5, 1.0]))
+    talker = Talker(9)
+    energy = resume(talker.fit(), talker.landmarks, CAMERA, HEAD)[0].select(keys.rows)
+    held = at_ease(replace(energy, strictness=np.full(5, 2.0)), keys)
+    np.testing.assert_allclose(held.strictness, 2 * 30 ** np.array([0, 0.5, 1, 0, 0]))

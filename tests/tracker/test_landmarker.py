@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tracker.face_detector import INPUT_SIZE, anchors, decode, letterbox, merge, overlaps, tiles
+from tracker.face_detector import INPUT_SIZE, Face, anchors, decode, letterbox, merge, overlaps, tiles
 from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import (
     BLENDSHAPE_INPUT,
@@ -18,7 +18,16 @@ from tracker.landmark_indices import (
     POINTS,
     RIGHT_EYE_OUTER,
 )
-from tracker.landmarker import FaceLandmarker, LandmarkTracker, Roi, crop, roi_from_points, track_landmarks
+from tracker.landmarker import (
+    SEARCH_INTERVAL,
+    FaceLandmarker,
+    LandmarkTracker,
+    Roi,
+    crop,
+    roi_from_face,
+    roi_from_points,
+    track_landmarks,
+)
 from tracker.raster import project, render
 
 SIZE, FOCAL = 400, 900.0
@@ -225,3 +234,103 @@ def test_a_cut_forgets_the_region(head: HeadModel, landmarker: FaceLandmarker) -
     assert fresh is not None
     marks = track_landmarks(iter([(0.0, left), (0.04, right)]), 2, cuts={1})
     assert np.abs(marks.points[1] - fresh[0]).max() < 1e-3
+
+
+NOTHING = np.zeros((300, 600, 3), np.uint8)
+
+
+class _Crowd:
+    """A landmarker before which stand faces [n, 3] px: where, and how wide. What was asked of it is kept."""
+
+    def __init__(self, *faces: tuple[float, float, float]) -> None:
+        self.faces = np.array(faces, np.float64).reshape(-1, 3)
+        self.tiled: list[bool] = []
+        self.regions: list[Roi] = []
+
+    def detect(self, rgb: np.ndarray, tiled: bool = False) -> list[Face]:
+        self.tiled.append(tiled)
+        return [self._face(*one) for one in self.faces]
+
+    @staticmethod
+    def _face(x: float, y: float, width: float) -> Face:
+        eyes = np.float32([[x - width / 4, y], [x + width / 4, y]])
+        box = np.float32([x - width / 2, y - width / 2, x + width / 2, y + width / 2])
+        return Face(box, np.concatenate([eyes, np.zeros((4, 2), np.float32)]), 0.9)
+
+    def landmarks(self, rgb: np.ndarray, roi: Roi) -> tuple[np.ndarray, float, np.ndarray]:
+        """Of the face nearest to the region's middle, a fifth narrower than its box; of none without one in it."""
+        self.regions.append(roi)
+        away = np.hypot(self.faces[:, 0] - roi.x, self.faces[:, 1] - roi.y)
+        x, y, width = self.faces[away.argmin()]
+        points = np.zeros((POINTS, 3), np.float32)
+        points[:, :2] = (x, y) + 0.4 * width * np.random.default_rng(0).uniform(-1, 1, (POINTS, 2))
+        points[[RIGHT_EYE_OUTER, LEFT_EYE_OUTER], 1] = y
+        points[[RIGHT_EYE_OUTER, LEFT_EYE_OUTER], 0] = x - width / 4, x + width / 4
+        return points, float(away.min() < roi.side / 2), np.zeros(52, np.float32)
+
+
+def _where(found: tuple[np.ndarray, float, np.ndarray] | None) -> float:
+    assert found is not None
+    return float(found[0][[RIGHT_EYE_OUTER, LEFT_EYE_OUTER], 0].mean())
+
+
+def test_the_largest_face_is_followed_unless_another_is_meant() -> None:
+    crowd = _Crowd((100, 150, 40), (300, 150, 100), (500, 150, 60))
+    tracker = LandmarkTracker(cast(FaceLandmarker, crowd))
+    assert _where(tracker.next(NOTHING)) == pytest.approx(300)
+    meant = np.float32([460, 110, 540, 190])
+    assert _where(tracker.next(NOTHING, meant)) == pytest.approx(500)
+    assert _where(tracker.next(NOTHING)) == pytest.approx(500)  # and stays where it is
+    assert tracker.next(NOTHING, np.float32([180, 10, 200, 30])) is None
+
+
+def test_a_face_that_is_found_is_read_again_in_the_region_of_its_landmarks() -> None:
+    """That which the following frames will have."""
+    crowd = _Crowd((300, 150, 100))
+    tracker = LandmarkTracker(cast(FaceLandmarker, crowd))
+    found = tracker.next(NOTHING)
+    assert found is not None
+    detected, own = roi_from_face(crowd.detect(NOTHING)[0]), roi_from_points(found[0])
+    assert own.side < 0.85 * detected.side
+    tracker.next(NOTHING)
+    assert crowd.regions == [detected, own, own]
+
+
+def test_tiles_are_searched_once_in_a_while_when_there_is_no_face() -> None:
+    crowd = _Crowd()
+    tracker = LandmarkTracker(cast(FaceLandmarker, crowd))
+    for _ in range(2 * SEARCH_INTERVAL + 1):
+        assert tracker.next(NOTHING) is None
+    assert np.flatnonzero(crowd.tiled).tolist() == [0, SEARCH_INTERVAL, 2 * SEARCH_INTERVAL]
+    crowd.faces = np.array([[300.0, 150.0, 100.0]])
+    assert tracker.next(NOTHING) is not None
+    crowd.faces[0, 0] = 1e6  # lost: tiles are searched at once
+    tracker.next(NOTHING)
+    assert crowd.tiled[-1]
+
+
+def test_frames_come_as_long_after_each_other_as_their_times_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[float] = []
+    monkeypatch.setattr("tracker.landmarker.FaceLandmarker", lambda: None)
+    monkeypatch.setattr(LandmarkTracker, "next", lambda self, rgb, box, step_s: steps.append(step_s))
+    track_landmarks([(time, NOTHING) for time in (1.0, 1.02, 1.12)], 3)
+    assert steps == pytest.approx([0.04, 0.02, 0.1])
+
+
+def test_both_readings_of_a_face_count_alike_and_depth_is_in_pixels(
+    landmarker: FaceLandmarker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random, roi = np.random.default_rng(0), Roi(300.0, 150.0, 80.0, 0.0)
+    straight, error = random.uniform(0.2, 0.8, (POINTS, 3)), 0.01 * random.normal(size=(POINTS, 3))
+    mirrored = (straight - error)[MIRRORED] * (-1, 1, 1) + (1, 0, 0)
+
+    def reads(unit: np.ndarray, logit: float) -> object:
+        return lambda picture: [np.float32(256 * unit), np.float32([logit]), None]
+
+    monkeypatch.setattr(landmarker, "_landmarks", reads(straight + error, 3.0))
+    monkeypatch.setattr(landmarker, "_mirrored", reads(mirrored, -1.0))
+    points, presence, _ = landmarker.landmarks(NOTHING, roi)
+    # Half of the picture's width, edge to edge, is the middle of the region.
+    expected = 80 * (straight - (0.5, 0.5, 0)) + (300, 150, 0)
+    np.testing.assert_allclose(points, expected, atol=1e-3)
+    assert presence == pytest.approx(1 / (1 + np.exp(-1)))

@@ -35,3 +35,22 @@ def test_opened_moves_both_lips_alike():
     (upper, lower) = np.transpose(LIP_PAIRS)
     np.testing.assert_allclose(opened[0, lower] - opened[0, upper], np.tile([0.0, 16.0], (9, 1)))
     np.testing.assert_allclose(opened[0, lower] + opened[0, upper], face()[0, lower] + face()[0, upper])
+
+
+def test_a_millimetre_is_as_long_on_a_face_that_nods_and_points_down_one_that_leans():
+    x = np.zeros((3, 3 + POSE))
+    x[1, 3], x[2, 5] = 0.6, 0.5
+    lines = LipLines.across(face().repeat(3, 0), np.array([2000.0, 2000.0, 3000.0]), x)
+    np.testing.assert_allclose(lines.step[:2], [[0, 2], [0, 2]], atol=1e-9)
+    np.testing.assert_allclose(lines.step[2], [-3 * np.sin(0.5), 3 * np.cos(0.5)], atol=1e-9)
+
+
+def test_of_a_large_face_lines_are_means_and_not_single_pixels():
+    noise = np.random.default_rng(0).integers(0, 255, (900, 900, 3), dtype=np.uint8)
+    spread = []
+    for scale in (2, 8):
+        x = np.zeros((1, 3 + POSE))
+        lines = LipLines.across(face() * scale / 2, np.array([1000.0 * scale]), x)
+        spread.append(float(lines.read(noise, 0).std()))
+    # The blur is .6 of a step of .4 mm: of half a pixel at least, and of two.
+    assert spread[1] < 0.35 * spread[0]

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from tracker.lip_lines import SAMPLES, fineness
-from tracker.lip_opening import _lit_edge, lip_edges
+from tracker.lip_opening import TRUSTED, LipColours, _colour_axes, _lit_edge, lip_edges
 
 FRAMES, LIP_MM = 80, 7.0
 ALL = np.arange(FRAMES)
@@ -152,3 +152,29 @@ def test_soft_pictures_are_told_from_sharp_ones_whatever_their_noise(
 
 def test_a_black_picture_is_neither_soft_nor_sharp(openings: tuple[np.ndarray, np.ndarray]):
     assert np.isnan(fineness(np.zeros_like(painted(openings[0]))))
+
+
+def test_colours_are_those_against_the_lips_of_the_same_frame(openings: tuple[np.ndarray, np.ndarray]):
+    """So that light cancels, but for what the dark takes from contrasts."""
+    true, _ = openings
+    bright, dim = (_colour_axes(painted(true, gain=gain), marked(true)) for gain in (1.0, 0.5))
+    lips = (np.abs(SAMPLES) > true[..., None] / 2 + 1) & (np.abs(SAMPLES) < true[..., None] / 2 + LIP_MM - 1)
+    np.testing.assert_allclose(bright[lips].mean(0), dim[lips].mean(0), atol=0.02)
+    assert np.abs(bright - dim)[lips].mean() < 0.1
+
+
+def test_a_sample_counts_for_so_much_at_most_and_what_looks_alike_for_nothing(
+    openings: tuple[np.ndarray, np.ndarray],
+):
+    true, seen = openings
+    table = LipColours.of(painted(true), marked(seen)).table
+    assert table.max() == 0 and table.min() == -TRUSTED
+    assert (table.max(0) == 0).all() and (table == 0).all(0).mean() > 0.2  # colours that are never seen
+
+
+def test_what_lies_beyond_the_lips_is_not_looked_at(openings: tuple[np.ndarray, np.ndarray]):
+    true, seen = openings
+    colours, marks = painted(true), marked(seen)
+    known, beard = LipColours.of(colours, marks), colours.copy()
+    beard[(marks[..., :1] > SAMPLES) | (marks[..., 3:] < SAMPLES)] = DARK
+    np.testing.assert_array_equal(known.edges(beard, marks), known.edges(colours, marks))

@@ -8,7 +8,7 @@ import pytest
 
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, LIPS, POINTS
-from tracker.occlusion import FaceWatch, regions
+from tracker.occlusion import CONTRAST, FaceWatch, _contrasts, _logs, _unlike, regions
 from tracker.track import Landmarks
 
 FRAMES, SIDE = 60, 240
@@ -188,3 +188,20 @@ def test_the_regions_are_apart_and_leave_out_eyes_and_rim():
     assert {0, 13, 14, 17} <= right & left and len(right & left) < 0.25 * len(mouth)
     assert not {159, 145, 386, 374, 10, 152, 234, 454} & together
     assert min(map(len, (right, left, *upper))) > 40
+
+
+def test_what_lies_outside_of_a_picture_is_as_bright_as_the_rest_of_it():
+    random = np.random.default_rng(0)
+    usual = random.integers(60, 200, (1, 30, 3)).astype(np.uint8)
+    inside = np.arange(30)[None] < 20
+    dim = (0.4 * usual).astype(np.uint8)
+    whole = _contrasts(dim, np.ones_like(inside), _logs(usual)[0])
+    dim[:, 20:] = 255  # the border's
+    np.testing.assert_allclose(_contrasts(dim, inside, _logs(usual)[0]), whole, atol=0.12)
+
+
+def test_patterns_that_are_hardly_there_cannot_be_told_apart():
+    faint, other = 0.1 * CONTRAST * np.random.default_rng(0).normal(size=(2, 60))
+    none = np.zeros((0, 60))
+    assert _unlike(faint[None], np.ones((1, 60), bool), other, none)[0] < 0.05
+    assert _unlike(100 * faint[None], np.ones((1, 60), bool), 100 * other, none)[0] > 0.5

@@ -1,14 +1,21 @@
 """Overlay modes on a head rendered in known colours: they draw on the face alone, and say how well it fits."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from tests.tracker.turning_head import SIZE, picture, shifted_landmarks, turning_track
-from tracker.albedo import Rendering, learn_albedo, rerender
+from tests.flame_factory import FakeFlame
+from tests.tracker.test_flame import arrays, surface
+from tests.tracker.turning_head import SIZE, first_hits, picture, shifted_landmarks, turning_track
+from tracker.albedo import Rendering, _seen, learn_albedo, rerender
+from tracker.flame import flame_head
 from tracker.head import HeadModel, load_head
-from tracker.overlay import DETECTED, FITTED, MODES, NEEDS_ALBEDO, draw
-from tracker.scene import OUTSIDE, Crop, Scene, scene
+from tracker.overlay import DETECTED, FITTED, LIDS, LIPS, MODES, NEEDS_ALBEDO, draw
+from tracker.raster import vertex_normals
+from tracker.scene import OUTSIDE, Crop, Scene, place, scene
 from tracker.track import Landmarks, Track
 
 FRAMES, SHIFT = 6, 6.0
@@ -84,6 +91,8 @@ def test_a_picture_like_the_rendering_has_no_error(scenes: list[Scene], head: He
     off = one.part(draw(one, "error", head, Rendering(part, known, np.roll(part, 8, axis=1))))[known > 0]
     assert black.max() <= 4
     assert off.max() > 200
+    hot = off[off.max(1) > 200].astype(int)
+    assert (hot[:, 0] > hot[:, 2]).mean() > 0.9  # large errors are red and yellow, none is blue
 
 
 def test_the_rendering_comes_near_the_picture_and_less_so_at_a_wrong_pose(
@@ -131,3 +140,80 @@ def test_a_face_outside_of_the_part_shown_leaves_it_as_it_is(
 ) -> None:
     away = scene(picture(track, head, 0), Crop((0, 0), (40, 40), (80, 80)), track, 0, landmarks, head)
     assert (draw(away, "shaded", head, None) == away.picture).all()
+
+
+def test_a_scene_knows_how_large_the_face_is_shown(
+    track: Track, landmarks: Landmarks, head: HeadModel
+) -> None:
+    twice = scene(picture(track, head, 0), Crop((90, 75), (180, 150), SIZE), track, 0, landmarks, head)
+    assert twice.px_per_m == pytest.approx(2 * track.focal / track.translation[0, 2])
+
+
+def test_a_head_with_joints_is_placed_as_they_turn(track: Track) -> None:
+    fake = FakeFlame()
+    flame, random = flame_head("flame", arrays(fake), surface(fake), {}), np.random.default_rng(3)
+    turns = random.normal(0, 0.2, (FRAMES, 4, 3)).astype(np.float32)
+    posed = replace(
+        track,
+        identity=random.normal(size=300).astype(np.float32),
+        expression=random.normal(size=(FRAMES, 100)).astype(np.float32),
+        jaw=turns[:, 0],
+        neck=turns[:, 1],
+        eyes=turns[:, 2:],
+    )
+    vertices, points = place(posed, 3, flame)
+    own = fake.vertices(
+        posed.identity, posed.expression[3], neck=turns[3, 1], jaw=turns[3, 0], eyes=turns[3, 2:]
+    )
+    expected = Rotation.from_rotvec(posed.rotation[3]).apply(own) + posed.translation[3]
+    np.testing.assert_allclose(vertices, expected, atol=1e-5)
+    embedding = flame.landmark_embedding
+    at = np.einsum("lc,lcx->lx", embedding.barycentric, expected[flame.faces[embedding.triangles]])
+    np.testing.assert_allclose(points, at, atol=1e-5)
+
+
+def test_the_legend_tells_grey_levels(
+    scenes: list[Scene], head: HeadModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr("tracker.overlay.letter", lambda picture, text, at, height: told.append(text))
+    one, none = scenes[0], np.zeros(scenes[0].raster.triangle.shape, np.uint8)
+    part = one.part(one.picture)
+    bar = draw(one, "error", head, Rendering(part, none, part))
+    assert told == ["0", "20", "40"]
+    assert bar[SIZE[1] // 2 :].reshape(-1, 3).max() > 240  # the brightest colour of the bar
+
+
+@pytest.mark.parametrize(
+    ("names", "colour"), [(("inner_lip",), LIPS), (("left_eyelid", "right_eyelid"), LIDS)]
+)
+def test_lips_and_both_lids_are_lined(
+    names: tuple[str, ...], colour: tuple[int, int, int], scenes: list[Scene], head: HeadModel
+) -> None:
+    drawn = draw(scenes[-1], "wireframe", head, None).astype(int)
+    for name in names:
+        for side in ("upper", "lower"):
+            x, y = np.round(scenes[-1].pixels[head.regions[f"{name}_{side}"], :2]).astype(int).T
+            near = np.stack([drawn[y + j, x + i] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+            assert np.median(np.abs(near - colour).sum(-1).min(0)) < 120
+
+
+def test_what_the_face_itself_hides_has_no_colour(
+    track: Track, landmarks: Landmarks, head: HeadModel
+) -> None:
+    """Against rays: behind the nose of a head that is turned by 40 degrees there is cheek."""
+    turned = (
+        Rotation.from_euler("y", 52, degrees=True) * Rotation.from_rotvec(track.rotation[0])
+    ).as_rotvec()
+    aside = replace(track, rotation=np.tile(turned.astype(np.float32), (FRAMES, 1)))
+    one = scene(np.zeros((*SIZE[::-1], 3), np.uint8), WHOLE, aside, 0, landmarks, head)
+    seen, normal = _seen(one), vertex_normals(one.vertices, one.faces)
+    distance = np.linalg.norm(one.vertices, axis=1)
+    ray = one.vertices / distance[:, None]
+    facing = -(normal * ray).sum(1)
+    assert facing[seen].min() > 0.4
+    towards = np.flatnonzero((facing > 0.5) & np.isin(np.arange(len(ray)), head.regions["face"]))[::2]
+    behind = distance[towards] - first_hits(ray[towards], one.vertices, one.faces)
+    hidden, bare = towards[behind > 0.006], towards[behind < 0.001]
+    assert len(hidden) > 3 and not seen[hidden].any()
+    assert seen[bare].mean() > 0.95

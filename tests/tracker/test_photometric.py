@@ -4,10 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.flame_factory import FakeFlame
 from tests.tracker.test_flame import arrays, surface
-from tracker.appearance import HARMONICS, appearance, frame_light, harmonics, shaded, skin_of
+from tests.tracker.turning_head import first_hits
+from tracker.appearance import (
+    FACING,
+    HARMONICS,
+    appearance,
+    frame_light,
+    harmonics,
+    seen_skin,
+    shaded,
+    skin_of,
+)
 from tracker.energy import POSE, Energy, Weights, landmark_model
 from tracker.flame import flame_head
 from tracker.halving import halved
@@ -87,6 +98,14 @@ def test_hessian_is_that_of_the_rows_of_seen_points(energy_and_x):
     assert not blind.linearize_skin(x).gradient.any()
 
 
+def test_landmarks_and_skin_curve_the_energy_together(energy_and_x):
+    energy, x = energy_and_x
+    parts = energy.landmarks.linearize(MODEL.mean, x), energy.linearize_skin(x)
+    whole = energy.linearize(MODEL.mean, x).hessian
+    np.testing.assert_allclose(whole, sum(part.hessian for part in parts), rtol=1e-9)
+    assert np.abs(parts[1].hessian).max() > 1e-3 * np.abs(parts[0].hessian).max()
+
+
 def test_view_reads_a_ramp_exactly_and_is_flat_outside():
     ramp = (3 * np.arange(40)[None, :] + 2 * np.arange(30)[:, None]).astype(np.float32)
     view = View(ramp[None], Window(np.array([[100.0, 50.0]]), 0.5, (40, 30), (640, 640)))
@@ -149,6 +168,51 @@ def test_light_and_albedo_explain_what_they_made():
     found = shaded(albedo, basis[1:], frame_light(covered[1:], albedo, basis[1:], seen[1:], usual))
     assert light.shape == (6, HARMONICS)
     assert np.abs(found - grey[1:]).mean() < 1.5
+
+
+def test_harmonics_are_nine_that_have_nothing_in_common():
+    """Over directions spread evenly (a golden spiral)."""
+    count = np.arange(4000) + 0.5
+    z, turn = 1 - 2 * count / 4000, np.pi * (1 + 5**0.5) * count
+    level = np.sqrt(1 - z**2)
+    basis = harmonics(np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=-1).astype(np.float32))
+    products = basis.T @ basis / 4000
+    np.testing.assert_allclose(products - np.diag(np.diag(products)), 0, atol=2e-3)
+    assert np.diag(products).min() > 0.05
+
+
+def test_light_of_which_a_frame_tells_nothing_is_the_usual_one():
+    rng = np.random.default_rng(4)
+    normals = rng.normal(size=(1, 300, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    basis, albedo = harmonics(normals), rng.uniform(0.5, 1.0, 300).astype(np.float32)
+    usual = np.array([120.0, 10, -20, -30, 5, 3, 0, 4, 2])
+    grey = shaded(albedo, basis, 0.5 * usual[None])
+    front = np.float32(normals[..., 2] < -0.9)
+    np.testing.assert_allclose(frame_light(grey, albedo, basis, 0 * front, usual)[0], usual, rtol=1e-3)
+    some = frame_light(grey, albedo, basis, front, usual)
+    expected, turned_away = shaded(albedo, basis, some), normals[0, :, 2] > 0.5
+    assert np.abs(expected - grey)[front > 0].max() < 1.5  # where it is seen, it is half as bright
+    assert np.isfinite(expected).all() and np.abs(expected[0, turned_away]).max() < 255
+
+
+def test_skin_is_seen_where_rays_meet_it_and_not_aslant():
+    """Of a head turned by 40 degrees the nose hides cheek, and the far side lies aslant."""
+    skin = skin_of(HEAD, MODEL, IDENTITY)
+    turn = Rotation.from_euler("y", 40, degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    vertices = ((HEAD.template - MODEL.centre) @ turn.T + [0, 0, 0.6]).astype(np.float32)
+    principal, size = np.array([199.5, 199.5]), (400, 400)
+    own = np.array([[0.0, 0.0], [399.0, 399.0]])
+    seen, normal = seen_skin(skin, HEAD, vertices, FOCAL, principal, size, own)
+    points = np.einsum("pc,pcx->px", skin.barycentric, vertices[HEAD.faces[skin.triangles]])
+    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    facing = -(normal * ray).sum(1)
+    assert facing[seen].min() > FACING
+    some = np.flatnonzero(facing > FACING + 0.05)[::8]
+    behind = np.linalg.norm(points[some], axis=1) - first_hits(ray[some], vertices, HEAD.faces)
+    hidden, bare = some[behind > 0.007], some[behind < 0.002]
+    assert len(hidden) > 3 and not seen[hidden].any()
+    assert seen[bare].mean() > 0.97
 
 
 def test_sample_points_lie_on_skin_alone():

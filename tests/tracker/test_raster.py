@@ -115,3 +115,15 @@ def test_supersampling_does_not_move_the_picture() -> None:
         y, x = np.mgrid[:80, :80]
         centres.append([(weight * x).sum() / weight.sum(), (weight * y).sum() / weight.sum()])
     np.testing.assert_allclose(centres[0], centres[1], atol=0.1)
+
+
+def test_what_the_light_does_not_reach_has_the_skys_share_of_it() -> None:
+    vertices, faces = _icosphere()
+    albedo = np.full((len(vertices), 3), 200, np.uint8)
+    raster = rasterize(np.c_[project(vertices, 200.0, (40, 40)), vertices[:, 2]], faces, (80, 80))
+    behind, ahead = (
+        shade(raster, faces, vertices, albedo, (0, 0, 0), light=(0, 0, z), ambient=0.25).max()
+        for z in (1, -1)
+    )
+    assert behind == 100  # squares stand for light: half of 200
+    assert abs(int(ahead) - 200) <= 1

@@ -17,7 +17,8 @@ from tracker.lip_lines import LipLines
 from tracker.occlusion import Appearance
 from tracker.raster import render
 from tracker.refine import _overlap, _read_widths, _stretches, _with_landmarks, refine_track
-from tracker.skin_fit import Photometry, Subject
+from tracker.skin_fit import Photometry, Subject, fit_stretch, learn_levels
+from tracker.solver import Smoothness
 from tracker.track import Bundle, Camera, Landmarks, Track
 
 HEAD = load_head()
@@ -149,6 +150,33 @@ def test_how_fine_the_light_is_is_told_by_the_whole_clip(dark_mouth: Film, monke
     assert dark_mouth.refine(pictures).fineness == at_once < 0.8 * dark_mouth.refine().fineness
 
 
+def test_what_moves_all_key_frames_alike_is_taken_for_an_error_of_the_albedo(film: Film):
+    """Grey levels tell how frames differ: their mean stays where landmarks have it."""
+    energy, x, _, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
+    subject, rows = Subject.of(HEAD, film.track.identity, energy, Photometry(), SIZE), np.arange(0, FRAMES, 3)
+    cuts, x = [subject.window.cut(film.pictures[row], row) for row in rows], x[rows]
+    levels, alone = learn_levels(subject, cuts, rows, x), Smoothness.none(*x.shape)
+    free = [replace(level, pull=0 * level.pull) for level in levels]
+    drifts = []
+    for some in (levels, free):
+        found, _, _ = fit_stretch(subject, some, cuts, rows, x, alone)
+        assert np.abs(found - x).max() > 0.01
+        drifts.append(np.linalg.norm((found - x)[:, :-6].mean(0)))
+    assert drifts[0] < 0.7 * drifts[1]
+
+
+def test_skin_beside_the_mouths_inside_is_not_compared(film: Film):
+    """What a blur mixes with teeth and dark: the coarser it is, the more."""
+    energy, _, _, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
+    subject, rows = Subject.of(HEAD, film.track.identity, energy, Photometry(), SIZE), np.zeros(1, np.int64)
+    cut, whole = subject.window.cut(film.pictures[0], 0), np.ones((1, len(subject.skin)), np.float32)
+    for blur_px in (1.0, 3.0):
+        seen = subject.photometric([cut], rows, whole, blur_px).seen[0]
+        beside = subject.skin.to_inside < 0.99 * blur_px / (np.median(energy.px_per_m) * subject.window.scale)
+        assert not seen[beside].any() and beside.sum() > 3
+        np.testing.assert_allclose(seen[subject.skin.to_inside > 0.005], 0.1)
+
+
 def test_skin_outside_of_the_picture_is_not_seen(film: Film):
     energy, x, _, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
     first, size = np.zeros(1, np.int64), (SIZE[0], 150)
@@ -221,6 +249,32 @@ def test_the_bundles_poses_are_kept_where_it_has_them(film: Film):
     # What moves in the face is found as well.
     assert motion_error_mm(held, film) < 1.02 * motion_error_mm(free, film)
     assert opening_error_mm(held, film.gap) < 1.02 * opening_error_mm(free, film.gap)
+
+
+def test_poses_go_all_of_the_way_to_the_turned_bundle_and_after_the_skin_half_of_it(
+    film: Film, monkeypatch: pytest.MonkeyPatch
+):
+    """Again where the identity is another one, and not at all where the skin says otherwise."""
+    turned, held = replace(NO_BUNDLE, frame=np.arange(3, dtype=np.int32)), list[tuple[bool, float]]()
+
+    def hold(x, bundle, good, run, time, sound, share=1.0):
+        held.append((bundle is turned, share))
+        return x + 1e-3 * np.eye(x.shape[1])[-1]
+
+    monkeypatch.setattr(refine, "turned_as_far", lambda bundle, x, good, sound, sd: turned)
+    monkeypatch.setattr(refine, "hold_poses", hold)
+    monkeypatch.setattr(refine, "fit_identity_to_skin", lambda subject, cuts, keys, x: subject.identity + 0.1)
+    monkeypatch.setattr(refine, "fit_landmarks", lambda subject, x, smoothness: x)
+    monkeypatch.setattr(refine, "learn_levels", lambda *_: [])
+    monkeypatch.setattr(
+        refine, "_fitted_to_skin", lambda subject, levels, cuts, x, *_: (x, np.ones((len(x), 2)))
+    )
+    places = []
+    for rigid in (False, True):
+        monkeypatch.setattr(refine, "nearer_to_skin", lambda *_, rigid=rigid: rigid)
+        places.append(film.refine().track.translation)
+    assert held == [(True, 1.0), *[(True, 1.0), (True, 1.0), (True, 0.5)]]
+    np.testing.assert_allclose(places[1] - places[0], np.tile([0, 0, 3e-3], (FRAMES, 1)), atol=1e-6)
 
 
 def test_a_bundle_of_no_rigid_body_is_not_followed(film: Film):

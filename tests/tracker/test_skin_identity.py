@@ -1,6 +1,7 @@
 """The identity from grey levels: derivatives, what tells nothing of it, and that it comes nearer to the truth."""
 
 from dataclasses import replace
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ import pytest
 from benchmarks.track_errors import similarity
 from tests.tracker.test_photometric import HEAD, IDENTITY, energy_and_x  # noqa: F401
 from tests.tracker.test_refine import filmed, freckled
+from tracker import skin_identity
 from tracker.appearance import HARMONICS
 from tracker.photometric import PhotometricEnergy
-from tracker.skin_identity import SubjectEnergy
+from tracker.skin_identity import SubjectEnergy, nearer_to_skin
 
 Case = tuple[SubjectEnergy, np.ndarray, np.ndarray]
 
@@ -84,3 +86,22 @@ def test_a_strangers_face_comes_nearer_to_the_truth():
         return 1e3 * float(np.linalg.norm(scale * found @ turned.T + shift - true, axis=1).mean())
 
     assert error_mm(film.refine().track.identity) < 0.8 * error_mm(film.track.identity)
+
+
+@pytest.mark.parametrize(("own", "others", "nearer"), [((1, 3), (3, 2), False), ((1, 2), (4, 2), True)])
+def test_poses_are_judged_by_what_either_believes_of_the_light(
+    own: tuple[int, int], others: tuple[int, int], nearer: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """Each looks best in the light that it was asked for. own, others: losses of both in the light of either."""
+    x, other, rows = np.zeros((4, 3)), np.ones((4, 3)), np.array([1, 3])
+
+    def at(skin: object, moves: object, basis: object, identity: object, where: np.ndarray) -> object:
+        losses = own if not where.any() else others
+        return Mock(skin_loss=lambda shape, place: np.full(2, losses[int(place.any())]))
+
+    monkeypatch.setattr(SubjectEnergy, "at", at)
+    monkeypatch.setattr(skin_identity, "_movements", lambda subject: np.zeros((5, 3, 2)))
+    monkeypatch.setattr(skin_identity, "replace", lambda part, **_: part)
+    subject = MagicMock(identity=np.zeros(2), blurs_px=[2.0, 1.0], skin=Mock(rest=np.zeros((5, 3))))
+    subject.look.return_value = None, None
+    assert nearer_to_skin(subject, {1: None, 3: None}, rows, x, other) == nearer

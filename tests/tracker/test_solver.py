@@ -1,8 +1,18 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from tracker.energy import POSE, Quadratic
-from tracker.solver import Bounds, Smoothness, band_step, bounded_step, schur_step
+from tracker.energy import POSE, Quadratic, Weights
+from tracker.solver import (
+    Bounds,
+    Smoothness,
+    band_step,
+    bounded_step,
+    schur_step,
+    solve_frames,
+    solve_subject,
+)
 from tracker.track import STEP_S
 
 FRAMES, WEIGHTS, IDENTITIES = 7, 3, 4
@@ -155,6 +165,63 @@ def test_schur_step_solves_the_dense_system(rng):
     step_identity, step = schur_step(quadratic, identity, prior, 0.0, none, still)
     np.testing.assert_allclose(step_identity, expected[:IDENTITIES], rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(step.ravel(), expected[IDENTITIES:], rtol=1e-6, atol=1e-8)
+
+
+class Bowl:
+    """An energy of n frames with a minimum at `goal`, too flat by its model: plain steps lead far beyond it.
+
+    An identity moves all goals. flat: share of the true curvature that its model has.
+    """
+
+    model = SimpleNamespace(modes=SimpleNamespace(lower=np.full(WEIGHTS, -9.0), upper=np.full(WEIGHTS, 9.0)))
+    weights = Weights(identity=0.5)
+
+    def __init__(self, goal: np.ndarray, flat: float, moves: np.ndarray) -> None:
+        self.goal, self.flat, self.moves = goal, flat, moves
+
+    def __len__(self) -> int:
+        return len(self.goal)
+
+    def select(self, frames: slice) -> "Bowl":
+        return Bowl(self.goal[frames], self.flat, self.moves)
+
+    def shape(self, identity: np.ndarray) -> np.ndarray:
+        return identity @ self.moves
+
+    def value(self, shape: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return 0.5 * ((x - self.goal - shape) ** 2).sum(1)
+
+    def linearize(self, shape: np.ndarray, x: np.ndarray, with_identity: bool = False) -> Quadratic:
+        by = np.concatenate([-self.moves, np.eye(UNKNOWNS)]) if with_identity else np.eye(UNKNOWNS)
+        gradient = (x - self.goal - shape) @ by.T
+        hessian = np.broadcast_to(self.flat * by @ by.T, (len(x), *2 * (len(by),)))
+        return Quadratic(self.value(shape, x), gradient, hessian.copy())
+
+
+@pytest.mark.parametrize("flat", [1.0, 0.2])
+def test_frames_come_to_their_goals_however_far_plain_steps_lead(rng, flat: float):
+    """A model that is five times too flat takes steps of four times the way too many."""
+    goal = rng.normal(size=(FRAMES, UNKNOWNS))
+    bowl = Bowl(goal, flat, np.zeros((IDENTITIES, UNKNOWNS)))
+    alone = Smoothness.none(FRAMES, UNKNOWNS)
+    found = solve_frames(bowl, np.zeros(UNKNOWNS), np.zeros_like(goal), alone, steps=60)
+    assert np.abs(found - goal).max() < 0.1
+
+
+@pytest.mark.parametrize("flat", [1.0, 0.2])
+def test_an_identity_is_held_by_its_prior_once_for_each_key_frame(rng, flat: float):
+    """Of frames whose weights are bounded at zero only the identity is left to explain what is seen."""
+    goal, moves = rng.normal(size=(FRAMES, UNKNOWNS)), rng.normal(size=(IDENTITIES, UNKNOWNS))
+    goal[:, WEIGHTS:], moves[:, WEIGHTS:] = 0, 0
+    bowl = Bowl(goal, flat, moves)
+    bowl.model = SimpleNamespace(modes=SimpleNamespace(lower=np.zeros(WEIGHTS), upper=np.zeros(WEIGHTS)))
+    start = np.zeros(IDENTITIES)
+    solution = solve_subject(bowl, start, np.zeros_like(goal), steps=200)
+    # sum over frames of |goal + identity moves|^2 + .5 |identity|^2, each once a frame.
+    expected = -np.linalg.solve(moves @ moves.T + 0.5 * np.eye(IDENTITIES), moves @ goal.mean(0))
+    np.testing.assert_allclose(solution.identity, expected, atol=0.02)
+    value = bowl.value(bowl.shape(solution.identity), solution.x).sum()
+    assert solution.value == pytest.approx(value + 0.25 * FRAMES * solution.identity @ solution.identity)
 
 
 def test_weights_at_a_bound_are_held_only_when_pushed_out():

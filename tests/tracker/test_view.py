@@ -37,3 +37,17 @@ def test_what_lies_outside_of_the_picture_is_not_its_own() -> None:
     # 20 px of the left border at half the size are 10; the picture ends 90 px on, and goes on below the window.
     np.testing.assert_allclose(window.own(0, 0.0), [[9.75, 0], [54.25, 49]])
     np.testing.assert_allclose(window.own(0, 2.0), [[11.75, 0], [52.25, 49]])
+
+
+def test_windows_hold_every_face_but_one_that_is_far_too_large() -> None:
+    """Faces as wide as high, at the middle of a picture; one comes nearer, another is none."""
+    sizes = np.array([100.0] * 8 + [160.0, 900.0])
+    corners = np.array([[-0.5, -0.5], [0.5, 0.5], [0.0, 0.2]])
+    observed = 640 + sizes[:, None, None] * corners
+    window = Window.around(observed, 10 * sizes, 500.0, (1280, 1280))
+    assert window.scale == 0.5  # of the usual face's 1000 px per m
+    assert window.size == (115, 115)  # twice the usual face and a margin, at that scale
+    low, high = ((end - window.origin + 0.5) * 0.5 - 0.5 for end in (observed.min(1), observed.max(1)))
+    assert (low[:9] > 0).all() and (high[:9] < 114).all()
+    assert Window.around(observed[:9], 10 * sizes[:9], 500.0, (1280, 1280)).size == (92, 92)
+    assert Window.around(observed, sizes, 500.0, (1280, 1280)).scale == 1.0

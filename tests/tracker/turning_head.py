@@ -55,3 +55,17 @@ def picture(track: Track, head: HeadModel, frame: int) -> np.ndarray:
     vertices, _ = place(track, frame, head)
     x, y = track.principal.tolist()
     return render(vertices, head.faces, head.albedo, FOCAL, (x, y), SIZE)
+
+
+def first_hits(rays: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """[n] m, how far from the camera unit rays [n, 3] first meet a mesh (Moeller and Trumbore); inf if they do not."""
+    a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
+    along, out = np.cross(-a, b - a), np.full(len(rays), np.inf)
+    for n, ray in enumerate(rays.astype(np.float64)):
+        across = np.cross(ray, c - a)
+        size = (across * (b - a)).sum(1)
+        size = np.where(np.abs(size) < 1e-14, np.nan, size)
+        u, v, far = -(across * a).sum(1) / size, along @ ray / size, (along * (c - a)).sum(1) / size
+        hit = (u >= -1e-6) & (v >= -1e-6) & (u + v <= 1 + 1e-6) & (far > 0)
+        out[n] = far[hit].min(initial=np.inf)
+    return out
