@@ -18,8 +18,10 @@ class GroundTruth:
     """A head of T frames.
 
     neutral: [V, 3] m. faces: [F, 3]. displacement: [T, V, 3] m. rotation: [T, 3, 3] and translation: [T, 3] m take
-    the head frame to the camera frame (OpenCV). focal: px. lip_gap_mm: [T]. covered: [T] 0..1, share of the lips that
-    something hides. vertices: [V] those of the embedded head that these are; None where the mesh is another.
+    the head frame to the camera frame (OpenCV). focal: px. lip_gap_mm: [T], between the vertices of `HeadModel`'s
+    opening; of another mesh what is free between the lips in the face's middle: from the lowest point of the upper one
+    to the highest of the lower one. covered: [T] 0..1, share of the lips that something hides. vertices: [V] those of
+    the embedded head that these are; None where the mesh is another.
     """
 
     neutral: F64

@@ -12,7 +12,7 @@ from kornia.geometry import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, minimum_filter1d
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import maximum_bipartite_matching
+from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
 from scipy.spatial import cKDTree
 from scipy.stats import rankdata
 from torch import from_numpy
@@ -24,6 +24,7 @@ from tracker.raster import project, vertex_normals
 from tracker.track import F64, Track
 
 NORMAL_M = 0.01  # two points whose normals differ by a unit count as this far apart
+MIDDLE_M = 3e-4  # from the face's middle
 CLOSED_MM = 0.5
 AJAR_MM = CLOSED_MM + 0.3  # true lips hover about the limit, and openings may err by so much
 COVERED = 0.2  # share of the lips from which a frame counts as covered
@@ -54,7 +55,7 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
     if truth.vertices is not None:
         errors |= face_errors(neutral, track, fitted, judged, head, truth)
     errors |= lip_errors(neutral, frame, track, judged, head, truth)
-    errors |= opening_errors(track.lip_gap_mm.astype(np.float64) * frame[0], truth.lip_gap_mm, judged)
+    errors |= opening_errors(openings(neutral, frame, track, head, truth), truth.lip_gap_mm, judged)
     return errors | {
         "rotation_deg": rotation_error(fitted[judged], truth.rotation[judged]),
         "focal_pct": 100 * (track.focal / truth.focal - 1),
@@ -139,6 +140,32 @@ def lip_errors(
         "lip_motion_truth": _mean_norm(true - true.mean(0)),
         "jitter_mm": _mean_norm(bend),
     }
+
+
+def openings(neutral: F64, frame: Similarity, track: Track, head: HeadModel, truth: GroundTruth) -> F64:
+    """[T] mm, how far the fitted lips are apart, measured as the true ones are; see `GroundTruth`."""
+    scale, turned, _ = frame
+    if truth.vertices is not None:
+        return track.lip_gap_mm.astype(np.float64) * scale
+
+    def heights(vertices: NDArray[np.integer]) -> F64:
+        moved = np.tensordot(track.expression, head.expression_basis[:, vertices].astype(np.float64), axes=1)
+        return 1e3 * scale * (neutral[vertices] + moved) @ turned[1]
+
+    upper, lower = middle_of_lips(head)
+    return heights(upper).min(1) - heights(lower).max(1)
+
+
+def middle_of_lips(head: HeadModel) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+    """Vertices of the upper and of the lower lip in the face's middle, from their outer rims to the mouth's inside."""
+    lips = head.regions["lips"]
+    middle = lips[np.abs(head.template[lips, 0]) < MIDDLE_M]
+    sides = head.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    sides = sides[np.isin(sides, middle).all(1)]
+    part = connected_components(csr_array((np.ones(len(sides)), sides.T), 2 * (len(head.template),)))[1]
+    lines = (head.regions[f"inner_lip_{lip}"] for lip in ("upper", "lower"))
+    upper, lower = (middle[part[middle] == part[line[len(line) // 2]]] for line in lines)
+    return upper, lower
 
 
 def opening_errors(gap: F64, true: F64, judged: Bool) -> dict[str, float]:
