@@ -71,7 +71,7 @@ class Source:
     """An opened container: of what can be decoded its `video` stream, None where there is none, and its `sounds`.
 
     Of several video streams it is the one that players show, or the largest. A phone may put sound of a format of its
-    own before, or behind, one that others can read.
+    own before, or behind, one that others can read. `lost`: how many pictures did not decode so far.
 
     It reads through one file handle with no protocols allowed, so that a playlist cannot open other files.
     """
@@ -90,6 +90,7 @@ class Source:
         shown = [s for s in streams.video if _is_known(s) and not _is_cover(s)]
         self.video: Any = max(shown, key=_prominence, default=None)
         self.sounds: list[Any] = [s for s in streams.audio if _is_known(s)]
+        self.lost = 0
         self._guesses = self.container.format.name == "avi"
         self._late: int | None = None
 
@@ -114,6 +115,7 @@ class Source:
             try:
                 frames = packet.decode()
             except av.FFmpegError:
+                self.lost += stream is self.video
                 continue
             for frame in frames:
                 if self._guesses and stream is self.video:

@@ -61,7 +61,7 @@ class FrameReader(Iterator[tuple[float, U8]]):
         """Time, picture, and whether it is damaged."""
         start, step = self.info.video_start_s, 1 / self.info.fps if self.info.fps else 0.04
         damage_end, size, whole = -1.0, (0, 0), (0, 0)
-        matrix = np.eye(2, dtype=np.int64)
+        matrix, lost = np.eye(2, dtype=np.int64), 0
         with Source(self._path) as source:
             source.video.thread_type = "AUTO"
             for time, frame in _in_time(source.decode(source.video), start, step, self._path):
@@ -70,10 +70,11 @@ class FrameReader(Iterator[tuple[float, U8]]):
                     matrix, size, whole = display_matrix(frame), self._size(*seen), seen
                 self._check_size(time, whole, seen)
                 self.interlaced += bool(frame.interlaced_frame)
-                if frame.is_corrupt:
+                if frame.is_corrupt or (source.lost > lost and not frame.key_frame):
                     damage_end = time + DAMAGE_S
                 elif frame.key_frame:
                     damage_end = -1.0
+                lost = source.lost
                 yield time, _turned(self._to_rgb(frame, size), matrix), time <= damage_end
 
     def _check_size(self, time: float, first: tuple[int, int], now: tuple[int, int]) -> None:

@@ -322,6 +322,23 @@ def test_damaged_pictures_are_named_until_the_next_key(tmp_path: Path) -> None:
     assert not damaged[-1]
 
 
+def test_pictures_predicted_from_one_that_does_not_decode_are_damaged(tmp_path: Path) -> None:
+    pictures = [np.full((64, 96, 3), 4 * i, np.uint8) for i in range(40)]
+    path = write_video(tmp_path / "v.mp4", pictures, [i / 25 for i in range(40)], keys=10)
+    with av.open(str(path)) as whole:
+        packets = [packet for packet in whole.demux(video=0) if packet.size]
+        at = next(packet.pos for packet in packets if round(25 * packet.pts * packet.time_base) == 13)
+    data = bytearray(path.read_bytes())
+    data[at : at + 4] = b"\xff\xff\xff\xff"  # longer than the file
+    path.write_bytes(data)
+    reader = FrameReader(path)
+    seen = {round(25 * time): reader.damaged for time, _ in reader}
+    damaged = {index for index, is_damaged in seen.items() if is_damaged}
+    assert 13 not in seen
+    # Those shortly before may be predicted from it as well.
+    assert set(range(14, 20)) <= damaged <= set(range(11, 20))
+
+
 @pytest.mark.parametrize(
     ("step_s", "keys", "damaged"),
     [(0.04, (0, 20), range(10, 20)), (1.0, (0, 20), range(10, 16)), (1.0, (0, 12), range(10, 12))],
