@@ -16,7 +16,7 @@ from model.speech import SpeechEncoder, load_encoder, resample
 from personalize.feature_cache import encode_cached
 from personalize.run import RunFolder
 from personalize.settings import Settings
-from personalize.sound import read_audio
+from personalize.sound import SPEECH_RATE, on_video_clock, read_audio
 
 BASE_CHECKPOINT = Path(__file__).parent.parent / "model" / "assets" / "base.safetensors"
 Part = Literal["train", "val", "test"]
@@ -61,6 +61,8 @@ def load_base(settings: Settings) -> Checkpoint:
 def speech_features(sound: Path, at: NDArray[np.float64], encoder: SpeechEncoder) -> NDArray[np.float32]:
     """Features [N, W] of a sound file at times [N] s of its own clock."""
     audio, start_s = read_audio(sound)
+    if start_s > 0:  # before it begins it is silent: the first features held would be a sound of that length
+        audio, start_s = on_video_clock(audio, start_s, start_s + len(audio) / SPEECH_RATE), 0.0
     features, times = encode_cached(encoder, audio)
     return resample(features, times + start_s, at)
 

@@ -11,7 +11,9 @@ from model.speech import load_encoder
 from personalize import stages, subject_data
 from personalize.pipeline import STAGES
 from personalize.settings import Settings
-from personalize.subject_data import BASE_CHECKPOINT, base_path, load_base, tracked
+from personalize.sound import read_audio, write_wav
+from personalize.subject_data import BASE_CHECKPOINT, base_path, load_base, speech_features, tracked
+from personalize.talkers.film import ASSETS
 from tests.model import talker
 from tests.personalize.counting_encoder import CountingEncoder
 
@@ -51,6 +53,17 @@ def test_the_stages_that_use_them_depend_on_their_content(base: Path) -> None:
     copy.write_bytes(base.read_bytes())
     same = Settings(base=str(copy), encoder="mine")
     assert all(stage.assets(same) == stage.assets(own) for stage in STAGES)
+
+
+def test_sound_that_begins_late_is_silent_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a run, whose sound file has that silence in it."""
+    speech, _ = read_audio(ASSETS / "demo_speech.flac")
+    word = speech[8000:24_000]
+    write_wav(tmp_path / "padded.wav", np.concatenate([np.zeros(16_000, np.float32), word]))
+    padded, at = read_audio(tmp_path / "padded.wav")[0], np.arange(60) / 30
+    wanted = speech_features(tmp_path / "padded.wav", at, load_encoder())
+    monkeypatch.setattr(subject_data, "read_audio", lambda _: (padded[16_000:], 1.0))
+    assert np.array_equal(speech_features(tmp_path / "late.mp4", at, load_encoder()), wanted)
 
 
 def test_a_span_is_cut_where_nothing_was_tracked_for_long() -> None:
