@@ -195,19 +195,23 @@ def resample(
     """Values [T, K] at presentation times -> 30 fps: (start_s, [N, K], valid [N]).
 
     Each run of valid frames of one segment is interpolated on its own, by shape-preserving cubics: they pass
-    through every measured frame and cannot overshoot a closure. Frames between runs hold the nearest value.
+    through every measured frame and cannot overshoot a closure. Frames between runs hold the nearest value and are not
+    valid, of two shots that meet at least one.
     """
     start_s = float(time[0])
     at = start_s + np.arange(int(np.floor((time[-1] - start_s) * FPS + 1e-6)) + 1) / FPS
     measured = np.flatnonzero(valid)
     middles = (time[measured][1:] + time[measured][:-1]) / 2
     nearest = measured[np.searchsorted(middles, at)]
-    result, seen = values[nearest].astype(np.float32), np.zeros(len(at), bool)
+    result, shot = values[nearest].astype(np.float32), np.full(len(at), -1)
     breaks = (np.diff(segment[measured]) != 0) | (np.diff(time[measured]) > LONGEST_BRIDGE_S)
-    for run in np.split(measured, np.flatnonzero(breaks) + 1):
+    for number, run in enumerate(np.split(measured, np.flatnonzero(breaks) + 1)):
         if len(run) < 2:
             continue
         inside = (at >= time[run[0]] - 1e-6) & (at <= time[run[-1]] + 1e-6)
         result[inside] = PchipInterpolator(time[run], values[run], axis=0)(at[inside])
-        seen |= inside
-    return start_s, result, seen
+        shot[inside] = number
+    # Of 60 frames a second a cut takes one, and the motion's frames may lie on those before and behind it: side by side
+    # they would be learned from as one movement.
+    meet = (shot[1:] != shot[:-1]) & (shot[:-1] >= 0)
+    return start_s, result, (shot >= 0) & ~np.append(False, meet)

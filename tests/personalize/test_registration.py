@@ -100,6 +100,18 @@ def test_nothing_is_made_up_across_a_cut_or_a_gap() -> None:
     assert valid[(at < time[49]) | ((at > time[50]) & (at < time[69]))].all()
 
 
+@pytest.mark.parametrize("rate", [30, 50, 60, 120])
+def test_shots_never_stand_side_by_side(rate: int) -> None:
+    """The first frame after a cut is left out: at 60 a second that may be just the one the motion passes over."""
+    time = np.arange(6 * rate) / rate
+    for cut in range(2 * rate, 2 * rate + 8):
+        shot = (np.arange(len(time)) >= cut).astype(np.int32)
+        usable = np.arange(len(time)) != cut
+        _, out, valid = resample(shot[:, None].astype(np.float32), time, usable, shot)
+        assert not (np.diff(out[:, 0]).astype(bool) & valid[1:] & valid[:-1]).any()
+        assert (~valid).sum() <= 2 and valid[[0, -1]].all()
+
+
 def test_another_topology_is_transferred(head: HeadModel) -> None:
     """A coarse ball with a bump is registered onto a finer one that is scaled and shifted."""
 
