@@ -112,7 +112,9 @@ class _Run:
         if not self._parts:
             return self._start, np.zeros(0, np.float32)
         self._parts += [out.to_ndarray() for out in self._resampler.resample(None)]
-        return self._start, _one_channel(np.concatenate(self._parts, axis=1))
+        # Sound stored as numbers with a point may hold ones that are none.
+        channels = np.nan_to_num(np.concatenate(self._parts, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
+        return self._start, _one_channel(channels)
 
 
 def _kind(frame: Any) -> tuple[str, str, int]:

@@ -300,6 +300,20 @@ def test_sound_of_an_unknown_format_alone_is_none(tmp_path: Path) -> None:
     assert not probe(path).has_audio and len(read_audio(path)[0]) == 0
 
 
+def test_samples_that_are_no_numbers_are_silent(tmp_path: Path) -> None:
+    """Of a WAV of floats, as editors export it."""
+    samples = np.full(1600, 0.5, "<f4")
+    samples[[100, 200, 300]] = np.nan, np.inf, -np.inf
+    kind = struct.pack("<HHIIHH", 3, 1, 16_000, 64_000, 4, 32)
+    chunks = b"WAVEfmt " + struct.pack("<I", len(kind)) + kind + b"data" + struct.pack("<I", samples.nbytes)
+    path = tmp_path / "floats.wav"
+    path.write_bytes(b"RIFF" + struct.pack("<I", len(chunks) + samples.nbytes) + chunks + samples.tobytes())
+    for rate in (16_000, 48_000):
+        read, _ = read_audio(path, rate)
+        assert np.isfinite(read).all() and (read == 0).any()
+        assert np.median(read) == pytest.approx(0.5, abs=1e-3)
+
+
 def test_wav_keeps_its_samples(tmp_path: Path) -> None:
     samples = np.linspace(-1, 1, 1000, dtype=np.float32)
     write_wav(tmp_path / "a.wav", samples)
