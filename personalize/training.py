@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +26,7 @@ from model.trainer import Trainer
 from model.training_config import TrainingConfig
 from personalize.corpus import Corpus, check_parts, tested, there
 from personalize.errors import UserError
+from personalize.files import sha256_file, sha256_json, write_text
 from personalize.mouth import mouth_regions
 from personalize.protocol import compare_systems
 from personalize.reporter import Reporter
@@ -36,6 +37,7 @@ from personalize.vocaset import TRAIN, open_vocaset
 F32 = NDArray[np.float32]
 
 CHUNK_FRAMES = 256  # of one motion, decoded together
+VOCASET_FILES = ("*.npy", "*.pkl", "vertices_npy/*.npy", "wav/*.wav")  # of both layouts
 
 
 @dataclass(frozen=True)
@@ -68,13 +70,15 @@ def train_on_vocaset(
         faces = read_faces(mesh, data.vertex_count)
         names, speakers = tested(data, adapt), there(data, TRAIN)
         check_parts(data, report)
-        work = _work_folder(out)
+        speech = load_encoder(settings.encoder)
+        files = [mesh, *(path for pattern in VOCASET_FILES for path in folder.glob(pattern))]
+        work = _work_folder(out, _training_key(settings, speech, files), first=rank == 0)
         with report.stage("basis"):
             spoken = [(name, number) for name in speakers for number in data.sentences(name)]
             motion = motion_basis(
                 lambda: (data.displacements(*place) for place in spoken), seed=settings.seed
             )
-        corpus = Corpus(data, motion, load_encoder(settings.encoder))
+        corpus = Corpus(data, motion, speech)
         with report.stage("speech"):
             train, val = corpus.training(report.progress), corpus.validation()
         template = np.mean(list(data.templates.values()), axis=0).astype(np.float32)
@@ -109,7 +113,9 @@ def train_on_motions(folder: Path, out: Path, settings: TrainSettings, report: R
     Returns {"checkpoint", "modes", "held"}. Raises UserError, in one line, for whatever the user can mend.
     """
     with _mendable(folder), joined(settings.device) as (rank, device):
-        motions, work, speech = _read_motions(folder), _work_folder(out), load_encoder(settings.encoder)
+        motions, speech = _read_motions(folder), load_encoder(settings.encoder)
+        files = [folder / f"{name}.{kind}" for name in motions for kind in ("npz", "wav")]
+        work = _work_folder(out, _training_key(settings, speech, files), first=rank == 0)
         first = next(iter(motions.values()))
         with report.stage("basis"):
             basis = motion_basis(
@@ -222,15 +228,33 @@ def _motion_sequence(
     return Sequence(coefficients, speech_features(sound, times, encoder), motion.valid, style)
 
 
-def _work_folder(out: Path) -> Path:
-    """`<out>.work`, made; UserError where it cannot be, or `out` is a folder."""
+def _training_key(settings: TrainSettings, speech: SpeechEncoder, files: Iterable[Path]) -> str:
+    """Hash of what decides the trained model, and its scores: the settings, the speech encoder and the data's files."""
+    data = [(path.name, sha256_file(path)) for path in sorted(files)]
+    return sha256_json([settings.iterations, settings.seed, settings.architecture, speech.name, data])
+
+
+def _work_folder(out: Path, key: str, first: bool) -> Path:
+    """`<out>.work`, made, the training's key beside what a continuation needs.
+
+    first: of several processes the one that writes. Raises UserError where the folder cannot be made, `out` is a
+    folder, or what was begun there is another training.
+    """
     if out.is_dir():
         raise UserError(f"{out}: a folder; give --out the name of a file, as {out / 'model.safetensors'}")
     work = out.with_name(f"{out.name}.work")
+    key_file = work / "key"
     try:
         work.mkdir(parents=True, exist_ok=True)
+        begun = key_file.read_text() if key_file.is_file() else key
+        if first:
+            write_text(key_file, begun)
     except OSError as error:
         raise UserError(f"{work}: cannot be written ({error.strerror}); choose another --out") from None
+    if begun != key:
+        raise UserError(
+            f"{work}: holds a training with other settings or data; give another --out, or delete this folder"
+        )
     return work
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -109,6 +110,9 @@ def test_it_goes_on_where_it_stopped(
     assert len(names) == len(set(names)), "nothing finished is judged twice"
     with pytest.raises(UserError, match="other settings"):
         train(tmp_path / "base.safetensors", **{**options, "iterations": 4})
+    fake.pickle(folder / "templates.pkl", {n: t * 1.01 for n, t in fake.templates.items()})
+    with pytest.raises(UserError, match="other settings or data"):
+        train(tmp_path / "base.safetensors", **options)
 
 
 def write_motions(fake: FakeVocaset, folder: Path) -> Path:
@@ -148,6 +152,11 @@ def test_tracked_motions_train_too(
     assert "modes hold" in capsys.readouterr().out
     base = Checkpoint.load(tmp_path / "base.safetensors")
     assert base.styles == ("anna", "bob") and {"lips", "inner_lip_upper"} <= base.regions.keys()
+    train(tmp_path / "base.safetensors", motions=folder, iterations=4)
+    motion = Motion.load(folder / "bob.npz")
+    replace(motion, coefficients=motion.coefficients[::-1]).save(folder / "bob.npz")
+    with pytest.raises(UserError, match="other settings or data; give another --out, or delete this folder"):
+        train(tmp_path / "base.safetensors", motions=folder, iterations=4)
     (folder / "bob.wav").unlink()
     with pytest.raises(UserError, match=r"bob\.wav is missing"):
         train(tmp_path / "other.safetensors", motions=folder, iterations=4)
