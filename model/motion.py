@@ -24,6 +24,8 @@ BASIS_ERROR_M = 1e-5
 # What a motion file may hold once unpacked: an hour at 5 000 vertices as displacements is 6.5 GB, in basis
 # form 30 MB.
 LARGEST_MOTION_BYTES = 4 << 30
+# Farther than this no vertex of a face is moved by one mode: such numbers are of another unit, or nonsense.
+LARGEST_MOVE_M = 1.0
 # What a damaged archive of arrays, or the header of one of them, makes its readers raise.
 DAMAGED = (
     OSError, ValueError, EOFError, MemoryError, OverflowError, RuntimeError, SyntaxError, tokenize.TokenError,
@@ -51,7 +53,8 @@ class Motion:
     basis: [K, D, 3] f32, orthonormal in R^{3D}. coefficients: [N, K] f32 m; displacement = coefficients ·
     basis.
     valid: [N] bool, frames that were really seen.
-    provenance: tool, version, synthetic true/false, source, checkpoint, seed, guidance.
+    provenance: tool, version, synthetic true/false, source, checkpoint, seed, guidance; where its sound is known to be
+    late or early also `av_offset_s`.
     """
 
     fps: float
@@ -67,6 +70,11 @@ class Motion:
     def topology(self) -> str:
         """sha256 of D and the faces."""
         return topology_hash(len(self.template), self.faces)
+
+    @property
+    def av_offset_s(self) -> float:
+        """How late the sound that belongs to the motion is, s; 0 where nothing is known of it."""
+        return float(self.provenance.get("av_offset_s", 0.0))
 
     def displacements(self, vertices: NDArray[np.integer] | None = None) -> NDArray[np.float32]:
         """[N, D, 3] m, or [N, len(vertices), 3] for some vertices only."""
@@ -113,6 +121,7 @@ class Motion:
         except (KeyError, TypeError, ValueError) as error:
             raise MotionError(f"{path} is no motion file: {' '.join(str(error).split())}") from error
         _check_shapes(motion, path)
+        _check_values(motion, path)
         if "topology" in arrays and str(arrays["topology"]) != motion.topology:
             raise MotionError(f"{path} is damaged: its mesh is not the one its topology names")
         return motion
@@ -132,7 +141,7 @@ def principal_modes(displacements: NDArray[np.float32]) -> tuple[NDArray[np.floa
 
 
 def _check_shapes(motion: Motion, path: Path) -> None:
-    """MotionError naming the array whose shape or content does not fit the others."""
+    """MotionError naming the array whose shape does not fit the others, or that holds nothing."""
     vertices, modes, frames = len(motion.template), len(motion.basis), len(motion.coefficients)
     expected = {
         "template": (vertices, 3),
@@ -145,12 +154,35 @@ def _check_shapes(motion: Motion, path: Path) -> None:
         found = getattr(motion, name).shape
         if found != shape:
             raise MotionError(f"{path}: {name} has shape {found}, and {shape} fits the other arrays")
+    for name in ("template", "basis", "coefficients"):
+        if not getattr(motion, name).size:
+            raise MotionError(f"{path}: {name} is empty")
+
+
+def _check_values(motion: Motion, path: Path) -> None:
+    """MotionError saying which of the motion's numbers cannot be used."""
+    vertices, coefficients = len(motion.template), motion.coefficients[motion.valid]
     if len(motion.faces) and not 0 <= motion.faces.min() <= motion.faces.max() < vertices:
         raise MotionError(f"{path}: faces name vertices that do not exist (there are {vertices})")
     if not (math.isfinite(motion.fps) and motion.fps > 0 and math.isfinite(motion.start_s)):
         raise MotionError(f"{path}: fps {motion.fps} and start_s {motion.start_s} are not usable")
-    if not (np.isfinite(motion.basis).all() and np.isfinite(motion.coefficients[motion.valid]).all()):
+    if not all(np.isfinite(values).all() for values in (motion.template, motion.basis, coefficients)):
         raise MotionError(f"{path}: the motion holds values that are not finite")
+    moves = np.abs(coefficients).max(0, initial=0).astype(np.float64) * np.abs(motion.basis).max((1, 2))
+    if moves.max() > LARGEST_MOVE_M:
+        raise MotionError(
+            f"{path}: vertices move by {moves.max():.3g} m; coefficients times basis must be metres"
+        )
+    _check_provenance(motion.provenance, path)
+
+
+def _check_provenance(provenance: Any, path: Path) -> None:
+    """MotionError where it is no dictionary, or what is computed with is no number or list."""
+    if not isinstance(provenance, dict):
+        raise MotionError(f"{path}: provenance is no JSON object")
+    offset_s = provenance.get("av_offset_s", 0.0)
+    if not isinstance(offset_s, int | float) or not abs(offset_s) < 3600:
+        raise MotionError(f"{path}: av_offset_s {offset_s!r} in the provenance is no delay in seconds")
 
 
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:

@@ -97,6 +97,14 @@ def test_missing_arrays(path: Path, missing: str) -> None:
         ({"coefficients": np.full((40, talker.K), np.nan)}, "not finite"),
         ({"fps": "fast"}, "no motion file"),
         ({"provenance": "{"}, "no motion file"),
+        ({"provenance": "[]"}, "provenance is no JSON object"),
+        ({"provenance": "3"}, "provenance is no JSON object"),
+        ({"provenance": '{"av_offset_s": "late"}'}, "av_offset_s 'late' in the provenance"),
+        ({"provenance": '{"av_offset_s": NaN}'}, "av_offset_s nan in the provenance"),
+        ({"basis": np.zeros((0, talker.D, 3)), "coefficients": np.zeros((40, 0))}, "basis is empty"),
+        ({"coefficients": np.zeros((0, talker.K)), "valid": np.ones(0, bool)}, "coefficients is empty"),
+        ({"template": np.full((talker.D, 3), np.nan)}, "not finite"),
+        ({"coefficients": np.full((40, talker.K), 1e30)}, r"vertices move by \d\S+ m"),
     ],
 )
 def test_arrays_that_do_not_fit(path: Path, changes: dict[str, Any], message: str) -> None:
