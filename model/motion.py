@@ -53,8 +53,8 @@ class Motion:
     basis: [K, D, 3] f32, orthonormal in R^{3D}. coefficients: [N, K] f32 m; displacement = coefficients ·
     basis.
     valid: [N] bool, frames that were really seen.
-    provenance: tool, version, synthetic true/false, source, checkpoint, seed, guidance; where its sound is known to be
-    late or early also `av_offset_s`.
+    provenance: tool, version, synthetic true/false, source, checkpoint, seed, guidance; of a run and its edits also
+    av_offset_s, and av_offset_of, the sha256 of the files whose sound is that late.
     """
 
     fps: float
@@ -183,6 +183,8 @@ def _check_provenance(provenance: Any, path: Path) -> None:
     offset_s = provenance.get("av_offset_s", 0.0)
     if not isinstance(offset_s, int | float) or not abs(offset_s) < 3600:
         raise MotionError(f"{path}: av_offset_s {offset_s!r} in the provenance is no delay in seconds")
+    if not isinstance(provenance.get("av_offset_of", []), list):
+        raise MotionError(f"{path}: av_offset_of in the provenance is no list")
 
 
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:

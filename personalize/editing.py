@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,8 +70,11 @@ def edit_motion(
     folder = out or Path(f"{path.stem}.edit")
     if (folder / "motion.npz").resolve() == path.resolve():
         raise UserError(f"{folder}: holds the motion that is edited; choose another --out")
-    offset_s = _sound_offset(path, motion)
-    sound, features = (None, None) if speech is None else _sound_of(speech, motion, offset_s, encoder)
+    sound, features, offset_s = None, None, motion.av_offset_s
+    if speech is not None:
+        sound, features, offset_s = _sound_of(speech, motion, encoder)
+        if offset_s != motion.av_offset_s:
+            report.say(f"{speech}: another sound than the motion's own, whose offset is not applied")
     guidance = _guidance(settings, checkpoint, heard=features is not None)
     try:
         kept = _kept(motion, checkpoint, settings)
@@ -99,6 +101,7 @@ def edit_motion(
         "guidance": guidance,
         "rule": settings.rule,
         "av_offset_s": offset_s,
+        "av_offset_of": motion.provenance.get("av_offset_of", []),
         "edit": _as_json(path, kept, settings),
     }
     face = checkpoint.regions["face"]
@@ -157,23 +160,15 @@ def _with_keyframes(motion: Motion, source: Path, keyframes: NDArray[np.bool_]) 
     return with_frames(motion, other, keyframes, places)
 
 
-def _sound_offset(path: Path, motion: Motion) -> float:
-    """How late the sound is, s, where the motion is of a run whose sound did not fit its pictures, or made from one."""
-    registration = path.with_name("registration.json")
-    if motion.provenance.get("synthetic") is False and registration.is_file():
-        try:
-            return float(json.loads(registration.read_text(encoding="utf-8"))["av_offset_s"])
-        except (OSError, ValueError, KeyError, TypeError):
-            raise UserError(
-                f"{registration}: does not say how late the sound is; make the run's registration again, or give the "
-                "motion from another folder"
-            ) from None
-    return float(motion.provenance.get("av_offset_s", 0.0))
+def _sound_of(speech: Path, motion: Motion, encoder: SpeechEncoder) -> tuple[F32, F32, float]:
+    """Sound [S] at 48 kHz from the motion's first frame on, the speech features [N, W] of its frames, and its offset.
 
-
-def _sound_of(speech: Path, motion: Motion, offset_s: float, encoder: SpeechEncoder) -> tuple[F32, F32]:
-    """Sound [S] at 48 kHz from the motion's first frame on, and the speech features [N, W] of its frames."""
+    The offset, s, is how late the sound is against the motion: it was measured with that of the run, and other people's
+    sound has none.
+    """
     sound, start_s = read_speech(speech)
+    own = sha256_file(speech) in motion.provenance.get("av_offset_of", [])
+    offset_s = motion.av_offset_s if own else 0.0
     times = motion.start_s + offset_s + np.arange(len(motion.valid)) / motion.fps
     end_s = start_s + len(sound) / FILM_RATE
     if end_s < times[-1] - SOUND_SLACK_S:
@@ -182,7 +177,7 @@ def _sound_of(speech: Path, motion: Motion, offset_s: float, encoder: SpeechEnco
         )
     length_s = len(times) / motion.fps
     features = speech_features(speech, times, encoder)
-    return on_video_clock(sound, start_s - times[0], length_s, FILM_RATE), features
+    return on_video_clock(sound, start_s - times[0], length_s, FILM_RATE), features, offset_s
 
 
 def _as_json(path: Path, kept: Kept, settings: EditSettings) -> dict[str, object]:

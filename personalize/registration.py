@@ -19,7 +19,7 @@ from model.checkpoint import Checkpoint
 from model.motion import FPS, Motion, topology_hash
 from personalize.av_sync import estimate_av_offset
 from personalize.errors import UserError
-from personalize.files import write_json
+from personalize.files import sha256_file, write_json
 from personalize.heads import run_head
 from personalize.quality import read_reasons
 from personalize.reporter import Reporter
@@ -83,7 +83,8 @@ def register_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     motion, facts = register(
         track, frames.segment, run_head(settings), BaseFace(base.template, base.faces, base.basis)
     )
-    audio, start_s = read_audio(run.path / "ingest/audio.wav")
+    sound = run.path / "ingest/audio.wav"
+    audio, start_s = read_audio(sound)
     offset = estimate_av_offset(track.time, track.lip_gap_mm, track.valid, audio, start_s)
     applied = offset.offset_s if offset.sure else 0.0
     if applied:
@@ -98,10 +99,13 @@ def register_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
         "checkpoint": None,
         "seed": None,
         "guidance": None,
+        # With the motion, which may be used outside of this folder, and the files whose sound is meant.
+        "av_offset_s": applied,
+        "av_offset_of": [run.video_sha256, sha256_file(sound)],
     }
     dataclasses.replace(motion, provenance=provenance).save(folder / "motion.npz")
-    sound = {"av_offset_s": applied, "av_offset_estimate_s": offset.offset_s, "av_offset_sure": offset.sure}
-    write_json(folder / "registration.json", facts | sound)
+    facts |= {"av_offset_s": applied, "av_offset_estimate_s": offset.offset_s, "av_offset_sure": offset.sure}
+    write_json(folder / "registration.json", facts)
 
 
 def transfer_between(base: BaseFace, template: F32, faces: NDArray[np.int32]) -> Transfer:

@@ -230,7 +230,7 @@ class Overlay(Stage):
 class Registration(Stage):
     """Track -> Motion in the base model's topology, 30 fps, with the sound's offset."""
 
-    name, version = "registration", 3
+    name, version = "registration", 4
     needs = ("ingest/frames.npz", "ingest/audio.wav", *JUDGED)
     makes = ("motion.npz", "registration.json")
 

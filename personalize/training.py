@@ -222,8 +222,8 @@ def _decoded(motion: Motion) -> Iterator[F32]:
 def _motion_sequence(
     motion: Motion, basis: MotionBasis, sound: Path, encoder: SpeechEncoder, style: int
 ) -> Sequence:
-    """The motion in the new basis, with its sound."""
-    times = motion.start_s + np.arange(len(motion.valid)) / motion.fps
+    """The motion in the new basis, with its sound, which is as late as its run found it."""
+    times = motion.start_s + motion.av_offset_s + np.arange(len(motion.valid)) / motion.fps
     coefficients = motion.coefficients @ basis.coefficients(motion.basis)
     return Sequence(coefficients, speech_features(sound, times, encoder), motion.valid, style)
 

@@ -21,6 +21,7 @@ from model.checkpoint import Checkpoint
 from model.motion import Motion
 from personalize.demo import true_errors
 from personalize.evaluation.report import _facts, _warnings
+from personalize.files import sha256_file
 from personalize.pictures import FrameReader
 from personalize.run import RunFolder, read_refined, read_track, write_refined
 from personalize.sound import read_audio
@@ -95,6 +96,8 @@ def test_run_folder_holds_what_design_says(talk: Path, finished: Path) -> None:
     checkpoint = Checkpoint.load(finished / "checkpoint.safetensors")
     assert checkpoint.kind == "subject" and checkpoint.topology == motion.topology
     assert len(motion.valid) == pytest.approx(SECONDS * 30, abs=2)
+    heard = [sha256_file(path) for path in (talk, finished / "ingest/audio.wav")]
+    assert motion.provenance["av_offset_of"] == heard and motion.av_offset_s == 0
 
 
 def test_the_track_is_near_the_truth(talk: Path, finished: Path) -> None:

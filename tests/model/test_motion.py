@@ -100,6 +100,7 @@ def test_missing_arrays(path: Path, missing: str) -> None:
         ({"provenance": "[]"}, "provenance is no JSON object"),
         ({"provenance": "3"}, "provenance is no JSON object"),
         ({"provenance": '{"av_offset_s": "late"}'}, "av_offset_s 'late' in the provenance"),
+        ({"provenance": '{"av_offset_of": 1}'}, "av_offset_of in the provenance is no list"),
         ({"provenance": '{"av_offset_s": NaN}'}, "av_offset_s nan in the provenance"),
         ({"basis": np.zeros((0, talker.D, 3)), "coefficients": np.zeros((40, 0))}, "basis is empty"),
         ({"coefficients": np.zeros((0, talker.K)), "valid": np.ones(0, bool)}, "coefficients is empty"),

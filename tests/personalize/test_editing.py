@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from model.synthesis import synthesize
 from personalize import animation, editing
 from personalize.editing import EditSettings, edit_motion
 from personalize.errors import UserError
+from personalize.files import sha256_file
 from personalize.pictures import FrameReader
 from personalize.reporter import Reporter
 from personalize.sound import read_audio, write_wav
@@ -117,10 +117,11 @@ def test_keyframes_of_another_motion_lie_on_its_own_clock(
 def test_the_sound_of_a_run_lies_where_registration_put_it(
     motion: Path, speech: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run's measured delay moves the features; an edit of that edit knows it from the provenance."""
-    tracked = dataclasses.replace(Motion.load(motion), provenance={"synthetic": False})
-    tracked.save(tmp_path / "motion.npz")
-    (tmp_path / "registration.json").write_text(json.dumps({"av_offset_s": 0.08}))
+    """A run's measured delay moves the features, in an edit of the edit too, but not those of another's sound."""
+    own = {"synthetic": False, "av_offset_s": 0.08, "av_offset_of": ["the video's", sha256_file(speech)]}
+    dataclasses.replace(Motion.load(motion), provenance=own).save(tmp_path / "motion.npz")
+    other = tmp_path / "other.wav"
+    write_wav(other, read_audio(speech)[0][::-1])
     heard = []
     monkeypatch.setattr(
         editing,
@@ -128,13 +129,12 @@ def test_the_sound_of_a_run_lies_where_registration_put_it(
         lambda path, at, encoder: heard.append(at) or speech_features(path, at, encoder),
     )
     once = run(tmp_path / "motion.npz", speech, tmp_path / "once", keep=":0.7")[0]
-    run(once, speech, tmp_path / "twice", keep=":0.7")
+    silent = run(once, None, tmp_path / "silent", keep=":0.7")[0]
+    run(silent, speech, tmp_path / "twice", keep=":0.7")
+    replaced = run(tmp_path / "motion.npz", other, tmp_path / "other", keep=":0.7")[0]
     run(motion, speech, tmp_path / "plain", keep=":0.7")
-    assert [round(at[0], 4) for at in heard] == [0.58, 0.58, 0.5]
-    for broken in ("{}", "[]", "no JSON", '{"av_offset_s": null}'):
-        (tmp_path / "registration.json").write_text(broken)
-        with pytest.raises(UserError, match="does not say how late the sound is"):
-            run(tmp_path / "motion.npz", speech, tmp_path / "once", keep=":0.7")
+    assert [round(at[0], 4) for at in heard] == [0.58, 0.58, 0.5, 0.5]
+    assert [Motion.load(path).av_offset_s for path in (once, silent, replaced)] == [0.08, 0.08, 0.0]
 
 
 def test_mistakes_get_one_line_and_write_nothing(

@@ -29,7 +29,7 @@ from personalize.mouth import mouth_regions
 from personalize.protocol import METRICS, SYSTEMS, Reference, first_seconds, with_noise
 from personalize.reporter import Reporter
 from personalize.sound import write_wav
-from personalize.training import read_faces
+from personalize.training import _motion_sequence, read_faces
 from personalize.vocaset import TEST, TRAIN, VAL
 from tests.model import talker
 from tests.personalize.vocaset_factory import FLAME, FakeVocaset
@@ -160,6 +160,15 @@ def test_tracked_motions_train_too(
     (folder / "bob.wav").unlink()
     with pytest.raises(UserError, match=r"bob\.wav is missing"):
         train(tmp_path / "other.safetensors", motions=folder, iterations=4)
+
+
+def test_a_motions_sound_is_as_late_as_its_run_found_it(fake: FakeVocaset, tmp_path: Path) -> None:
+    folder = write_motions(fake, tmp_path / "motions")
+    motion, encoder = Motion.load(folder / "anna.npz"), load_encoder()
+    basis = motion_basis(lambda: [motion.displacements()], modes=8)
+    late = replace(motion, provenance={"av_offset_s": 0.2})
+    found = [_motion_sequence(m, basis, folder / "anna.wav", encoder, 0).features for m in (motion, late)]
+    np.testing.assert_allclose(found[1][:-6], found[0][6:], atol=1e-4)
 
 
 @pytest.mark.parametrize(
