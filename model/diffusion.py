@@ -23,6 +23,9 @@ Rule = Literal["posterior", "renoise", "ddim"]
 STEPS = 500
 # Deterministic DDIM follows a smooth path, which a tenth of the steps resolves.
 DDIM_STEPS = 50
+# Every step of renoise shows the network nothing but its own last guess. One that makes a guess a little larger does so
+# again at each step: at 500 of them samples run away to thousands of times the motion's size (docs/method.md).
+RENOISE_STEPS = 25
 
 # (x_t [N, *b, K], t) -> x0hat [N, *b, K].
 Predict = Callable[[Tensor, int], Tensor]
@@ -111,7 +114,8 @@ class Diffusion:
 
     def times(self, steps: int | None, rule: Rule) -> list[int]:
         """The diffusion steps that a reverse chain visits, from noise to clean."""
-        count = steps if steps is not None else (DDIM_STEPS if rule == "ddim" else self.steps)
+        usual = {"posterior": self.steps, "renoise": RENOISE_STEPS, "ddim": DDIM_STEPS}
+        count = usual[rule] if steps is None else steps
         if not 1 <= count <= self.steps:
             raise ModelError(f"{count} sampling steps asked for; a number from 1 to {self.steps} is possible")
         return torch.linspace(self.steps - 1, 0, count).round().int().tolist()
