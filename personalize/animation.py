@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from personalize.video_writer import VideoWriter
 F32 = NDArray[np.float32]
 
 FILM_SIZE = (720, 720)
+MOTION_NAME, FILM_NAME = "motion.npz", "animation.mp4"
 
 
 def animate_speech(
@@ -44,6 +46,7 @@ def animate_speech(
     the speech encoder that the checkpoint needs; None for the embedded one. Raises UserError for sound or checkpoint
     that cannot be used, and for an output that cannot be written.
     """
+    places = output_places(out or Path(f"{speech.stem}.animation"), samples, [speech])
     path, checkpoint, speech_encoder = load_subject(subject, encoder)
     sound, start_s = read_speech(speech)
     frames = max(1, round((start_s + len(sound) / FILM_RATE) * FPS))
@@ -54,8 +57,7 @@ def animate_speech(
             checkpoint, features, guidance=s, samples=samples, seed=seed, progress=report.progress
         )
     audio = on_video_clock(sound, start_s, frames / FPS, FILM_RATE)
-    folder = out or Path(f"{speech.stem}.animation")
-    for index, coefficients in enumerate(motions):
+    for index, (place, coefficients) in enumerate(zip(places, motions)):
         motion = Motion(
             fps=FPS,
             start_s=0.0,
@@ -75,7 +77,6 @@ def animate_speech(
                 "guidance": s,
             },
         )
-        place = sample_folder(folder, index, samples)
         yield from write_sample(place, motion, checkpoint.regions["face"], audio, report)
 
 
@@ -104,25 +105,44 @@ def read_speech(speech: Path) -> tuple[F32, float]:
     return sound, start_s
 
 
-def sample_folder(folder: Path, index: int, samples: int) -> Path:
-    """The folder of one of several samples, made if need be; UserError where it cannot be."""
-    place = folder if samples == 1 else folder / str(index)
+def output_places(folder: Path, samples: int, inputs: Iterable[Path | None]) -> list[Path]:
+    """The folder of each sample: `folder` itself, or of several `0`, `1`, … in it; none is made yet.
+
+    Raises UserError where one cannot be written, or where what is written would replace one of the inputs.
+    """
+    places = [folder] if samples == 1 else [folder / str(index) for index in range(samples)]
+    read = {os.path.realpath(path) for path in inputs if path is not None}
+    for place in places:
+        if not _can_be_written(place):
+            raise UserError(f"{place}: cannot be written; choose another --out")
+        for name in (MOTION_NAME, FILM_NAME):
+            if os.path.realpath(place / name) in read:
+                raise UserError(f"{place}: holds {name} that is read here; choose another --out")
+    return places
+
+
+def _can_be_written(folder: Path) -> bool:
+    """Whether files may be put into a folder that is there, or the folder be made."""
     try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{place}: cannot be written ({error.strerror}); choose another --out") from None
-    return place
+        nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    except OSError:
+        return False
+    return nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
 
 
 def write_sample(
     place: Path, motion: Motion, face: NDArray[np.integer], sound: F32 | None, report: Reporter
 ) -> Iterator[Path]:
-    """`motion.npz` and `animation.mp4` in the folder `place`; yields their paths. Sound as for `write_film`."""
-    motion.save(place / "motion.npz")
-    yield place / "motion.npz"
+    """Motion and film in the folder `place`, made if need be; yields their paths. Sound as for `write_film`."""
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{place}: cannot be written ({error.strerror}); choose another --out") from None
+    motion.save(place / MOTION_NAME)
+    yield place / MOTION_NAME
     with report.stage("film"):
-        write_film(place / "animation.mp4", motion, face, sound, report)
-    yield place / "animation.mp4"
+        write_film(place / FILM_NAME, motion, face, sound, report)
+    yield place / FILM_NAME
 
 
 def write_film(

@@ -16,7 +16,7 @@ from model.editing import Kept, edit, seam_of, with_frames
 from model.errors import ModelError
 from model.motion import Motion, MotionError
 from model.speech import SpeechEncoder
-from personalize.animation import load_subject, read_speech, sample_folder, write_sample
+from personalize.animation import load_subject, output_places, read_speech, write_sample
 from personalize.errors import UserError
 from personalize.files import sha256_file
 from personalize.regions import kept_share
@@ -65,11 +65,11 @@ def edit_motion(
     video file, its first picture), None for an unconditional edit without sound. Raises UserError for input that cannot
     be used.
     """
+    places = output_places(
+        out or Path(f"{path.stem}.edit"), settings.samples, [path, settings.source, speech]
+    )
     checkpoint_path, checkpoint, encoder = load_subject(subject, settings.encoder)
     motion = _load_motion(path)
-    folder = out or Path(f"{path.stem}.edit")
-    if (folder / "motion.npz").resolve() == path.resolve():
-        raise UserError(f"{folder}: holds the motion that is edited; choose another --out")
     sound, features, offset_s = None, None, motion.av_offset_s
     if speech is not None:
         sound, features, offset_s = _sound_of(speech, motion, encoder)
@@ -105,10 +105,9 @@ def edit_motion(
         "edit": _as_json(path, kept, settings),
     }
     face = checkpoint.regions["face"]
-    for index, result in enumerate(edited):
+    for index, (place, result) in enumerate(zip(places, edited)):
         seam = seam_of(result, kept.frames, motion, face)
         report.say(f"sample {index}: {kept.frames.sum()} of {len(kept.frames)} frames kept, seam {seam:.2f}")
-        place = sample_folder(folder, index, settings.samples)
         result = dataclasses.replace(result, provenance=facts | {"sample": index})
         yield from write_sample(place, result, face, sound, report)
 

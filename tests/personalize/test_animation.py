@@ -69,3 +69,15 @@ def test_a_checkpoint_of_another_encoder_says_which_and_how(
         animate(speech, subject, tmp_path / "out", samples=1)
     assert "wav2vec2#layer=12@0123" in str(caught.value) and "\n" not in str(caught.value)
     assert encoder.calls == 0 and not (tmp_path / "out").exists()
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_anything_is_made(
+    encoder: CountingEncoder, speech: Path, subject: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for out in (speech / "out", tmp_path / ("x" * 300)):
+        with pytest.raises(UserError, match="cannot be written; choose another --out"):
+            animate(speech, subject, out, samples=2)
+    monkeypatch.setattr(animation.os, "access", lambda path, mode: path != tmp_path)
+    with pytest.raises(UserError, match="cannot be written; choose another --out"):
+        animate(speech, subject, tmp_path / "a/b", samples=1)
+    assert encoder.calls == 0 and not (tmp_path / "a").exists()

@@ -176,5 +176,25 @@ def test_mistakes_get_one_line_and_write_nothing(
     refused("not a readable motion file", path=speech)
     refused("--guidance", audio=None, guidance=0.5)
     assert sorted(tmp_path.iterdir()) == before
-    with pytest.raises(UserError, match="holds the motion that is edited"):
-        run(motion, speech, motion.parent)
+
+
+def test_nothing_that_is_read_is_written_over(
+    motion: Path, speech: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(editing, "edit", lambda *_, **__: pytest.fail("it was refused too late"))
+    earlier = tmp_path / "out/1/motion.npz"
+    earlier.parent.mkdir(parents=True)
+    earlier.write_bytes(motion.read_bytes())
+    film = earlier.with_name("animation.mp4")
+    film.write_bytes(speech.read_bytes())
+    for read in (
+        {"motion": earlier, "audio": speech},
+        {"motion": motion, "audio": speech, "keyframes": "0.9", "source": earlier},
+        {"motion": motion, "audio": film},
+    ):
+        with pytest.raises(UserError, match=r"out/1: holds .* that is read here; choose another --out"):
+            run(out=tmp_path / "out", samples=2, **read)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"holds motion\.npz that is read here"):
+        run(earlier, speech, earlier.parent)
+    with pytest.raises(UserError, match="cannot be written; choose another --out"):
+        run(motion, speech, speech / "out")
