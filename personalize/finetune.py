@@ -7,7 +7,7 @@ from pathlib import Path
 
 from model.finetuning import EARLY_TOLERANCE, choose_checkpoint, subject_of, sweep_guidance
 from model.speech import load_encoder
-from model.trainer import Trainer
+from model.trainer import STATE_FILE, Trainer
 from model.training_config import TrainingConfig
 from personalize.errors import UserError
 from personalize.files import sha256_file, write_json
@@ -56,4 +56,13 @@ def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     choice = {"lip_error_mm": dict(zip([path.stem for path in candidates], errors))}
     write_json(folder / "guidance.json", {"sweep": sweep, "chosen": chosen, "candidates": choice})
     shutil.copy(work / "log.csv", folder / "log.csv")
+    _remove(work)
+
+
+def _remove(work: Path) -> None:
+    """A training's folder, its state first: what is left of it by a kill then begins anew.
+
+    A finished state without its candidates would neither train nor have anything to choose from, at every start.
+    """
+    (work / STATE_FILE).unlink()
     shutil.rmtree(work)

@@ -1,0 +1,36 @@
+"""Fine-tuning's folder of steps: whenever it is killed, the next run goes on."""
+
+from pathlib import Path
+
+import pytest
+
+from model.trainer import STATE_FILE, Trainer
+from model.training_config import TrainingConfig
+from personalize import finetune
+from tests.model import talker
+
+
+class Killed(Exception):  # noqa: N818
+    """Stands for a kill."""
+
+
+def test_killed_while_its_steps_are_removed_it_trains_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TrainingConfig(iterations=2, batch=2, frames=12, candidates=1, threads=1, precision="float32")
+    sequences = [talker.sequence(60, 0)]
+    checkpoint = talker.checkpoint(sequences)
+    candidates = Trainer(checkpoint, sequences, tmp_path, config).train()
+
+    def dying(work: Path) -> None:
+        """Removes all that shutil.rmtree may have met before the state, and no more."""
+        for path in work.iterdir():
+            if path.name != STATE_FILE:
+                path.unlink()
+        raise Killed
+
+    monkeypatch.setattr(finetune.shutil, "rmtree", dying)
+    with pytest.raises(Killed):
+        finetune._remove(tmp_path)
+    assert not candidates[0].exists()
+    assert Trainer(checkpoint, sequences, tmp_path, config).train() == candidates
