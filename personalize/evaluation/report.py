@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from personalize.av_sync import SMALLEST_S
 from personalize.evaluation import charts
 from personalize.evaluation.evaluate import SYSTEMS, Evaluation
 from personalize.files import write_text
@@ -119,17 +120,26 @@ def _warnings(run: RunFolder, media: dict[str, Any]) -> list[str]:
 
 def _facts(run: RunFolder, media: dict[str, Any], tracked: str | None) -> list[dict[str, str]]:
     registration = run.read_json("registration/registration.json")
-    sure = "corrected" if registration["av_offset_sure"] else "not sure, left as it is"
     # What was tracked before another tracker's result was given is still in the folder, and of no account.
     unused = () if tracked is None else ("camera", "track")
     took = {name: entry["seconds"] for name, entry in run.stages.items() if name not in unused}
     facts = {
         "video": f"{media['width']}x{media['height']}, {media['fps']:.2f} frames/s, {media['video_codec']}",
         "focal length": _focal(run, tracked),
-        "sound offset": f"{registration['av_offset_estimate_s'] * 1000:+.0f} ms ({sure})",
+        "sound offset": _sound_offset(registration),
         "stages": ", ".join(f"{name} {seconds:.0f} s" for name, seconds in took.items()),
     }
     return [{"name": name, "value": value} for name, value in facts.items()]
+
+
+def _sound_offset(registration: dict[str, Any]) -> str:
+    """What was found of it, and what was done about it."""
+    found_s = registration["av_offset_estimate_s"]
+    if registration["av_offset_sure"]:
+        done = "corrected"
+    else:
+        done = f"{'small' if abs(found_s) <= SMALLEST_S else 'not sure'}, left as it is"
+    return f"{found_s * 1000:+.0f} ms ({done})"
 
 
 def _data_url(path: Path, kind: str) -> str:
