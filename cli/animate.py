@@ -20,7 +20,14 @@ def animate(
     guidance: Annotated[
         float | None, typer.Option(min=0, max=2, help="Guidance scale; the checkpoint's own if not given.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first sample.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=LARGEST_SEED,
+            help="Seed of all samples: the same seed and number of samples give the same films.",
+        ),
+    ] = 0,
     encoder: Annotated[
         str | None,
         typer.Option(help="Folder or hub name of the speech encoder that the checkpoint was trained with."),

@@ -47,7 +47,14 @@ def edit(
     guidance: Annotated[
         float | None, typer.Option(min=0, max=2, help="Guidance scale; the checkpoint's own if not given.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the first sample.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=LARGEST_SEED,
+            help="Seed of all samples: the same seed and number of samples give the same films.",
+        ),
+    ] = 0,
     rule: Annotated[
         Literal["posterior", "renoise", "ddim"], typer.Option(help="How a denoising step goes back.")
     ] = "posterior",

@@ -53,8 +53,9 @@ class Motion:
     basis: [K, D, 3] f32, orthonormal in R^{3D}. coefficients: [N, K] f32 m; displacement = coefficients ·
     basis.
     valid: [N] bool, frames that were really seen.
-    provenance: tool, version, synthetic true/false, source, checkpoint, seed, guidance; of a run and its edits also
-    av_offset_s, and av_offset_of, the sha256 of the files whose sound is that late.
+    provenance: tool, version, synthetic true/false, source, checkpoint, seed, guidance; of a synthesis sample, and
+    samples, how many were drawn together; of a run and its edits av_offset_s, and av_offset_of, the sha256 of the files
+    whose sound is that late.
     """
 
     fps: float

@@ -73,6 +73,7 @@ def animate_speech(
                 "source": speech.name,
                 "checkpoint": sha256_file(path),
                 "seed": seed,
+                "samples": samples,
                 "sample": index,
                 "guidance": s,
             },

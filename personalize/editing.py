@@ -98,6 +98,7 @@ def edit_motion(
         "source": None if speech is None else speech.name,
         "checkpoint": sha256_file(checkpoint_path),
         "seed": settings.seed,
+        "samples": settings.samples,
         "guidance": guidance,
         "rule": settings.rule,
         "av_offset_s": offset_s,

@@ -55,6 +55,7 @@ def test_sound_is_encoded_once_for_all_samples_and_steps_and_not_again(
     assert encoder.calls == 1
     motions = [Motion.load(tmp_path / f"out/{index}/motion.npz") for index in range(3)]
     assert all(len(motion.valid) == 30 for motion in motions)
+    assert [(m.provenance["sample"], m.provenance["samples"]) for m in motions] == [(0, 3), (1, 3), (2, 3)]
     animate(speech, subject, tmp_path / "again", samples=3)
     assert encoder.calls == 1, "the second time the features come from the cache"
     again = Motion.load(tmp_path / "again/1/motion.npz")

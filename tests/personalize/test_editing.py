@@ -81,7 +81,8 @@ def test_frames_and_regions_are_kept_and_films_have_sound(
         assert edited.start_s == START_S and edited.topology == base.topology
     assert not np.allclose(made[0].displacements()[20], made[1].displacements()[20], atol=1e-4)
     facts = made[1].provenance
-    assert facts["synthetic"] and facts["source"] == "speech.wav" and facts["sample"] == 1
+    assert facts["synthetic"] and facts["source"] == "speech.wav"
+    assert (facts["sample"], facts["samples"]) == (1, 2)
     assert facts["edit"]["keep"] == ":0.7,1.8:" and facts["edit"]["kept_frames"] == 12
     assert facts["edit"]["keep_regions"] == ["eyelids"] and facts["guidance"] == base.guidance
     assert sum(1 for _ in FrameReader(paths[1])) == FRAMES
