@@ -27,7 +27,8 @@ def coefficient_weights(scale: Tensor, spread: Tensor, power: float) -> Tensor:
 
     Power 2 is the vertex metric: the basis is orthonormal, so sum_k scale_k^2 r_k^2 is the squared vertex distance.
     There the small coefficients get no gradient to speak of, and are sampled as white noise that shakes the face; a
-    power of 1/2 measured best (docs/method.md). A loss of 1 is what predicting the mean motion costs.
+    power of 1/2 measured best (docs/method.md). Without the velocity's part a loss of 1 is what predicting the mean
+    motion costs.
     """
     seen = spread.clamp(min=SMALLEST_SPREAD)
     weights = (scale * seen) ** power / seen**2

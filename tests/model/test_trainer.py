@@ -123,6 +123,17 @@ def test_divergence_names_the_iteration_and_keeps_what_was_good(tmp_path: Path) 
     assert (tmp_path / "candidate_00000001.safetensors").exists()
 
 
+def test_three_times_what_noise_costs_is_divergence(tmp_path: Path) -> None:
+    """The figure of docs/method.md."""
+    trainer = Trainer(*start(), tmp_path, TINY)
+    trainer._losses = [torch.tensor(62.9)]
+    assert trainer._checked_loss() == pytest.approx(62.9)
+    for loss in (63.1, float("nan")):
+        trainer._losses = [torch.tensor(loss)]
+        with pytest.raises(TrainingDivergedError):
+            trainer._checked_loss()
+
+
 def test_the_number_of_threads_comes_back(tmp_path: Path) -> None:
     before = torch.get_num_threads()
     Trainer(*start(), tmp_path, replace(TINY, threads=2, iterations=1, candidates=1)).train()
