@@ -76,16 +76,16 @@ class Source:
     It reads through one file handle with no protocols allowed, so that a playlist cannot open other files.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Raises UserError when the file is not there or FFmpeg cannot read it."""
-        self._file = _open_file(path)
+    def __init__(self, path: Path, wanted: str = "video") -> None:
+        """Raises UserError when the file is not there or FFmpeg cannot read it; wanted: what it should be."""
+        self._file = _open_file(path, wanted)
         try:
             options = {"protocol_whitelist": "none"}
             self.container: Any = av.open(self._file, mode="r", container_options=options)
         except (av.FFmpegError, OSError, ValueError) as error:
             self._file.close()
             reason = str(getattr(error, "strerror", None) or error).splitlines()[0]
-            raise UserError(f"{path}: not a video that can be read ({reason}); is it complete?") from None
+            raise UserError(f"{path}: not a {wanted} that can be read ({reason}); is it complete?") from None
         streams = self.container.streams
         shown = [s for s in streams.video if _is_known(s) and not _is_cover(s)]
         self.video: Any = max(shown, key=_prominence, default=None)
@@ -134,13 +134,13 @@ class Source:
         frame.pts = frame.dts - self._late
 
 
-def _open_file(path: Path) -> BinaryIO:
+def _open_file(path: Path, wanted: str) -> BinaryIO:
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise UserError(f"{path}: not a file; give a video file")
+            raise UserError(f"{path}: not a file; give a {wanted} file")
         if status.st_size == 0:
-            raise UserError(f"{path}: the file is empty; give a complete video")
+            raise UserError(f"{path}: the file is empty; give a complete {wanted}")
         return path.open("rb")
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; check the name") from None

@@ -80,8 +80,8 @@ def _one_channel(channels: F32) -> F32:
 
 
 def _picture_start(path: Path) -> float:
-    """Container time of the first picture; 0 for a pure sound file."""
-    with Source(path) as source:
+    """Container time of the first picture; 0 for a pure sound file. Of all that read sound it opens the file first."""
+    with Source(path, wanted="sound or video") as source:
         first = next(source.decode(source.video), None) if source.video is not None else None
         return frame_time(first, 0.0) if first is not None else 0.0
 

@@ -470,6 +470,17 @@ def test_what_is_no_video_is_refused_in_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
+def test_what_is_no_sound_is_refused_as_such(tmp_path: Path) -> None:
+    for path, says in {
+        tmp_path: "not a file; give a sound or video file",
+        _text(tmp_path / "empty.wav", ""): "the file is empty; give a complete sound or video",
+        _text(tmp_path / "text.wav", "not a sound"): "not a sound or video that can be read",
+    }.items():
+        with pytest.raises(UserError, match=says) as caught:
+            read_audio(path)
+        assert "\n" not in str(caught.value)
+
+
 def test_written_video_reads_back_with_its_sound(tmp_path: Path) -> None:
     path = tmp_path / "out ü.mp4"
     pictures = [p[:63, :95] for p in moving(30)]
