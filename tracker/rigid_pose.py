@@ -5,8 +5,8 @@ not, but they stand in a head frame of their own and exist on every third frame 
 landmarks' poses, one similarity for the clip taken out, is carried over to the frames between.
 
 A large turn of a flat face moves a point as a small one of a deep face does. Where a short clip, or a long lens, leaves
-open how deep the points lie, all turns of the bundle are too large or too small by one factor, which landmarks, fitted
-by a head of usual depth, tell, unless they are led astray themselves.
+open how deep the points lie, all turns of the bundle out of the picture's plane are too large or too small by one
+factor, which landmarks, fitted by a head of usual depth, tell, unless they are led astray themselves.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ def turned_as_far(bundle: Bundle, x: F64, good: Rows, sound: Rows, focal_sd_log:
     """The bundle whose heads turn as far from their mean pose as it and the poses in x [n, P] tell together.
 
     good: [n], frames of x. sound: its rows that are believed. focal_sd_log: of the bundle's focal length. Where
-    the two differ by more than that allows, landmarks have been led astray. Points and observations stay as they were.
+    the two differ by more than that allows, landmarks have been led astray. Points and observations stay as they were,
+    and so does what is turned in the picture's plane, which does not hang on how deep the points lie.
     """
     known = np.isin(bundle.frame, good[sound]) & _well_seen(bundle)
     if known.sum() < MIN_FRAMES:
@@ -54,14 +55,14 @@ def turned_as_far(bundle: Bundle, x: F64, good: Rows, sound: Rows, focal_sd_log:
     for _ in range(ROUNDS):  # a frame whose patches were led astray tells nothing
         middle = rotation[known].mean(weight)
         turn = (rotation * middle.inv()).as_rotvec()
-        told = (own * own.mean(weight).inv()).as_rotvec()
-        square = max(float(weight @ (turn[known] ** 2).sum(1)), 1e-9)
-        factor = float(np.clip(weight @ (told * turn[known]).sum(1) / square, 1 / MOST_TURN, MOST_TURN))
-        away = np.linalg.norm(told - factor * turn[known], axis=1)
+        seen, told = turn[known, :2], (own * own.mean(weight).inv()).as_rotvec()[:, :2]
+        square = max(float(weight @ (seen**2).sum(1)), 1e-9)
+        factor = float(np.clip(weight @ (told * seen).sum(1) / square, 1 / MOST_TURN, MOST_TURN))
+        away = np.linalg.norm(told - factor * seen, axis=1)
         weight = 1 / (1 + (away / max(FAR * float(np.median(away)), 1e-6)) ** 2)
     certain = LANDMARK_TURN**2 + LANDMARK_POSE**2 * weight.sum() / square
     factor **= _share(np.log(factor), certain, max(focal_sd_log, LEAST_FOCAL_SD))
-    turned = Rotation.from_rotvec(factor * turn) * middle
+    turned = Rotation.from_rotvec((factor, factor, 1.0) * turn) * middle
     # The face turns in its place.
     centre = bundle.points.mean(0, dtype=np.float64) if len(bundle.points) else np.zeros(3)
     return replace(

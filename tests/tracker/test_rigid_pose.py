@@ -14,6 +14,10 @@ RUN = np.zeros(FRAMES, np.int64)
 TIME = np.arange(FRAMES) / 25
 
 
+def turns_of(bundle: Bundle) -> Rotation:
+    return Rotation.from_rotvec(bundle.rotation)
+
+
 @pytest.fixture
 def truth() -> np.ndarray:
     """[n, 8] two weights and a pose that swings."""
@@ -125,17 +129,19 @@ def test_between_frames_corrections_go_by_the_time_and_not_by_how_many_frames_th
 
 
 def flattened(bundle: Bundle, factor: float) -> Bundle:
-    """The bundle, its turns from the mean pose all larger by a factor, as if the face were flatter than it is."""
-    rotation = Rotation.from_rotvec(bundle.rotation)
+    """The bundle, its turns out of the picture's plane larger by a factor, as if the face were flatter than it is."""
+    rotation = turns_of(bundle)
     middle = rotation.mean()
-    turned = Rotation.from_rotvec(factor * (rotation * middle.inv()).as_rotvec()) * middle
+    turned = Rotation.from_rotvec((factor, factor, 1.0) * (rotation * middle.inv()).as_rotvec()) * middle
     points = np.random.default_rng(3).normal([0, 0, -0.09], 0.02, (50, 3)).astype(np.float32)
     return replace(bundle, rotation=turned.as_rotvec().astype(np.float32), points=points)
 
 
 def turn_deg(bundle: Bundle) -> float:
-    rotation = Rotation.from_rotvec(bundle.rotation)
-    return float(np.degrees((rotation * rotation.mean().inv()).magnitude()).mean())
+    """Out of the picture's plane."""
+    rotation = turns_of(bundle)
+    turn = (rotation * rotation.mean().inv()).as_rotvec()[:, :2]
+    return float(np.degrees(np.linalg.norm(turn, axis=1)).mean())
 
 
 @pytest.mark.parametrize(
@@ -160,6 +166,20 @@ def test_a_bundle_turns_as_far_as_landmarks_and_it_tell_together(
         Rotation.from_rotvec(b.rotation).apply(b.points.mean(0)) + b.translation for b in (wrong, right)
     )
     np.testing.assert_allclose(after, before, atol=1e-5)  # the face stays where it was seen
+
+
+def test_what_is_turned_in_the_pictures_plane_stays(truth: np.ndarray) -> None:
+    """It is seen whatever the depth: a head that only leans leans as far as its patches do."""
+    leaning = truth.copy()
+    leaning[:, 2:5] = np.radians([0.0, 0.0, 12.0]) * np.sin(1.6 * TIME)[:, None]
+    leaning[:, 3] += np.radians(6.0) * np.sin(1.1 * TIME)
+    bundle = bundle_of(leaning, GOOD[::STEP])
+    told = leaning.copy()
+    told[:, 3:5] *= 1.4, 0.8
+    right = turned_as_far(bundle, told, GOOD, GOOD, 1.0)
+    before, after = ((r * r.mean().inv()).as_rotvec().T for r in map(turns_of, (bundle, right)))
+    np.testing.assert_allclose(after[2], before[2], atol=np.radians(0.05))
+    assert after[1].std() / before[1].std() == pytest.approx(1.4, rel=0.1)
 
 
 @pytest.mark.parametrize("jump", [0.4, 0.8, 2.0])
