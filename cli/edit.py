@@ -48,12 +48,7 @@ def edit(
         float | None, typer.Option(min=0, max=2, help="Guidance scale; the checkpoint's own if not given.")
     ] = None,
     seed: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=LARGEST_SEED,
-            help="Seed of all samples: the same seed and number of samples give the same films.",
-        ),
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all samples, which are drawn together.")
     ] = 0,
     rule: Annotated[
         Literal["posterior", "renoise", "ddim"], typer.Option(help="How a denoising step goes back.")
