@@ -68,8 +68,8 @@ def refine_track(
     segment: [T], number of the uninterrupted shot. frames: begins the clip anew: (time s, rgb [H, W, 3] u8), one for
     each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
     look like keeps its landmark fit, and so does one whose picture is missing. bundle: its poses, turned as far as
-    they and the landmarks tell together, are taken where skin looks more alike from frame to frame under them; they end
-    halfway between what grey levels and the bundle tell.
+    they and the landmarks tell together, are taken where skin looks as much alike from frame to frame under them,
+    in part where it hardly looks less so; they end halfway between what grey levels and the bundle tell.
     evidence: see `fit_track`.
     What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips and by how the
     lips move (tracker/lip_opening.py, tracker/lip_motion.py), depth by how the skin shifts in a turn
@@ -93,8 +93,8 @@ def refine_track(
     run, time = runs(good, segment, landmarks.time), landmarks.time[good]
     bundle = turned_as_far(bundle, x, good, sound, camera.focal_sd_log)
     on_bundle = hold_poses(x, bundle, good, run, time, sound)
-    if rigid := nearer_to_skin(subject, held, rows, x, on_bundle):
-        x = on_bundle
+    rigid = nearer_to_skin(subject, held, rows, x, on_bundle)
+    x = hold_poses(x, bundle, good, run, time, sound, rigid)
     widths, like_lips = _read_widths(lines, colours, good, segment, landmarks.time, sound)
     opened = lines.opened(observed, lines.widths(_fitted(subject, observed, x)) if widths is None else widths)
     subject = _with_landmarks(subject, opened, x, sound)
@@ -103,11 +103,10 @@ def refine_track(
         subject = subject.with_identity(identity)
         smoothness = smoothness_between(subject.energy, landmarks.time, good, segment)
         x = fit_landmarks(subject, x, smoothness)
-        x = hold_poses(x, bundle, good, run, time, sound) if rigid else x
+        x = hold_poses(x, bundle, good, run, time, sound, rigid)
     levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
     refined, deviation = _fitted_to_skin(subject, levels, cuts, x, good, segment, landmarks.time, progress)
-    if rigid:
-        refined = hold_poses(refined, bundle, good, run, time, sound, HALFWAY)
+    refined = hold_poses(refined, bundle, good, run, time, sound, HALFWAY * rigid)
     out = make_track(landmarks, camera, head, subject.energy, opened, identity, refined, good)
     fine = fineness(np.stack([colours[row] for row in rows]))
     return Refined(out, _relative(deviation, good, len(track.time)), like_lips, fine)

@@ -94,7 +94,7 @@ def hold_poses(
     """
     known = np.isin(bundle.frame, good[sound]) & _well_seen(bundle)
     row = np.searchsorted(good, bundle.frame[known])
-    if len(row) < MIN_FRAMES:
+    if not share or len(row) < MIN_FRAMES:
         return x
     rotation = Rotation.from_rotvec(bundle.rotation[known]).as_matrix()
     change = _corrections(x[row], rotation, bundle.translation[known].astype(np.float64))

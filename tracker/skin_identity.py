@@ -20,6 +20,8 @@ from tracker.view import U8, Index
 
 EVIDENCE = 3.0  # of the grey levels, times theirs in the fit of one frame
 STEPS = 1  # of Gauss and Newton at each blur: a second one tells no more
+# As the logarithm of how much it differs from frame to frame: chance alone makes such a difference.
+LESS_ALIKE = 0.04
 BLOCK = 256  # points whose rows of all key frames are held at once
 
 
@@ -144,11 +146,11 @@ def fit_identity_to_skin(subject: Subject, cuts: Mapping[int, U8], keys: KeyFram
     return identity if after < before else start[0]
 
 
-def nearer_to_skin(subject: Subject, cuts: Mapping[int, U8], rows: Index, x: F64, other: F64) -> bool:
-    """Whether the skin in the frames `rows` looks more alike where `other` [n, U] puts it than where x [n, U] does.
+def nearer_to_skin(subject: Subject, cuts: Mapping[int, U8], rows: Index, x: F64, other: F64) -> float:
+    """0..1, how surely the skin in the frames `rows` looks as much alike where `other` [n, U] puts it as where x does.
 
-    cuts: the frames' faces, by rows. Each of the two is asked what it believes of light and noise, and both are judged
-    by either.
+    1 if it does, 0 from LESS_ALIKE on. cuts: the frames' faces, by rows. Each of the two is asked what it believes of
+    light and noise, and both are judged by either.
     """
     both, moves = (x[rows], other[rows]), _movements(subject)
     identity = subject.identity.astype(np.float64)
@@ -160,7 +162,8 @@ def nearer_to_skin(subject: Subject, cuts: Mapping[int, U8], rows: Index, x: F64
         skin = replace(skin, landmarks=subject.energy.select(rows), skin=mean)
         energy = SubjectEnergy.at(skin, moves, basis, identity, at)
         loss += [energy.skin_loss(energy.shape(identity), where).sum() for where in both]
-    return bool(loss[1] < loss[0])
+    seen = loss.min() > 0  # black frames look alike under whatever poses
+    return float(np.clip(1 - np.log(loss[1] / loss[0]) / LESS_ALIKE, 0, 1)) if seen else 0.0
 
 
 def _movements(subject: Subject) -> F32:

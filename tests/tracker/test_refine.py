@@ -254,12 +254,12 @@ def test_the_bundles_poses_are_kept_where_it_has_them(film: Film):
 def test_poses_go_all_of_the_way_to_the_turned_bundle_and_after_the_skin_half_of_it(
     film: Film, monkeypatch: pytest.MonkeyPatch
 ):
-    """Again where the identity is another one, and not at all where the skin says otherwise."""
+    """Again where the identity is another one; not at all, or less far, where the skin says otherwise."""
     turned, held = replace(NO_BUNDLE, frame=np.arange(3, dtype=np.int32)), list[tuple[bool, float]]()
 
     def hold(x, bundle, good, run, time, sound, share=1.0):
         held.append((bundle is turned, share))
-        return x + 1e-3 * np.eye(x.shape[1])[-1]
+        return x + 1e-3 * share * np.eye(x.shape[1])[-1]
 
     monkeypatch.setattr(refine, "turned_as_far", lambda bundle, x, good, sound, sd: turned)
     monkeypatch.setattr(refine, "hold_poses", hold)
@@ -270,11 +270,13 @@ def test_poses_go_all_of_the_way_to_the_turned_bundle_and_after_the_skin_half_of
         refine, "_fitted_to_skin", lambda subject, levels, cuts, x, *_: (x, np.ones((len(x), 2)))
     )
     places = []
-    for rigid in (False, True):
+    for rigid in (0.0, 1.0, 0.2):
         monkeypatch.setattr(refine, "nearer_to_skin", lambda *_, rigid=rigid: rigid)
         places.append(film.refine().track.translation)
-    assert held == [(True, 1.0), *[(True, 1.0), (True, 1.0), (True, 0.5)]]
-    np.testing.assert_allclose(places[1] - places[0], np.tile([0, 0, 3e-3], (FRAMES, 1)), atol=1e-6)
+    asked = [(True, share) for rigid in (0.0, 1.0, 0.2) for share in (1.0, rigid, rigid, rigid / 2)]
+    assert held == asked
+    for place, share in zip(places[1:], (1.0, 0.2)):
+        np.testing.assert_allclose(place - places[0], np.tile([0, 0, 2.5e-3 * share], (FRAMES, 1)), atol=1e-6)
 
 
 def test_a_bundle_of_no_rigid_body_is_not_followed(film: Film):

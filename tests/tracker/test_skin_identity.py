@@ -88,9 +88,18 @@ def test_a_strangers_face_comes_nearer_to_the_truth():
     assert error_mm(film.refine().track.identity) < 0.8 * error_mm(film.track.identity)
 
 
-@pytest.mark.parametrize(("own", "others", "nearer"), [((1, 3), (3, 2), False), ((1, 2), (4, 2), True)])
+@pytest.mark.parametrize(
+    ("own", "others", "nearer"),
+    [
+        ((1, 3), (3, 2), 0.0),
+        ((1, 2), (4, 2), 1.0),
+        ((1, 2), (2, 1), 1.0),
+        ((50, 51), (50, 51), 0.505),
+        ((0, 0), (0, 0), 0.0),
+    ],
+)
 def test_poses_are_judged_by_what_either_believes_of_the_light(
-    own: tuple[int, int], others: tuple[int, int], nearer: bool, monkeypatch: pytest.MonkeyPatch
+    own: tuple[int, int], others: tuple[int, int], nearer: float, monkeypatch: pytest.MonkeyPatch
 ):
     """Each looks best in the light that it was asked for. own, others: losses of both in the light of either."""
     x, other, rows = np.zeros((4, 3)), np.ones((4, 3)), np.array([1, 3])
@@ -104,4 +113,4 @@ def test_poses_are_judged_by_what_either_believes_of_the_light(
     monkeypatch.setattr(skin_identity, "replace", lambda part, **_: part)
     subject = MagicMock(identity=np.zeros(2), blurs_px=[2.0, 1.0], skin=Mock(rest=np.zeros((5, 3))))
     subject.look.return_value = None, None
-    assert nearer_to_skin(subject, {1: None, 3: None}, rows, x, other) == nearer
+    assert nearer_to_skin(subject, {1: None, 3: None}, rows, x, other) == pytest.approx(nearer, abs=1e-3)
