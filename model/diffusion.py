@@ -24,7 +24,7 @@ STEPS = 500
 # Deterministic DDIM follows a smooth path, which a tenth of the steps resolves.
 DDIM_STEPS = 50
 # Every step of renoise shows the network nothing but its own last guess. One that makes a guess a little larger does so
-# again at each step: at 500 of them samples run away to thousands of times the motion's size (docs/method.md).
+# again at each step: at 500 of them samples run away to 1e5 times the motion's size (docs/method.md).
 RENOISE_STEPS = 25
 
 # (x_t [N, *b, K], t) -> x0hat [N, *b, K].

@@ -72,10 +72,10 @@ class Motion:
         """sha256 of D and the faces."""
         return topology_hash(len(self.template), self.faces)
 
-    @property
-    def av_offset_s(self) -> float:
-        """How late the sound that belongs to the motion is, s; 0 where nothing is known of it."""
-        return float(self.provenance.get("av_offset_s", 0.0))
+    def sound_offset_s(self, sha256: str) -> float:
+        """How late the sound of a file is against the motion, s; 0 of one of which nothing is known."""
+        known = sha256 in self.provenance.get("av_offset_of", [])
+        return float(self.provenance["av_offset_s"]) if known else 0.0
 
     def displacements(self, vertices: NDArray[np.integer] | None = None) -> NDArray[np.float32]:
         """[N, D, 3] m, or [N, len(vertices), 3] for some vertices only."""

@@ -28,6 +28,7 @@ from personalize.times import frames_at
 
 F32 = NDArray[np.float32]
 
+OFFSET = ("av_offset_s", "av_offset_of")  # of the run's sound, whatever is heard in an edit
 # Sound and pictures of one recording may end this far apart.
 SOUND_SLACK_S = 0.1
 
@@ -70,11 +71,7 @@ def edit_motion(
     )
     checkpoint_path, checkpoint, encoder = load_subject(subject, settings.encoder)
     motion = _load_motion(path)
-    sound, features, offset_s = None, None, motion.av_offset_s
-    if speech is not None:
-        sound, features, offset_s = _sound_of(speech, motion, encoder)
-        if offset_s != motion.av_offset_s:
-            report.say(f"{speech}: another sound than the motion's own, whose offset is not applied")
+    sound, features = (None, None) if speech is None else _sound_of(speech, motion, encoder, report)
     guidance = _guidance(settings, checkpoint, heard=features is not None)
     try:
         kept = _kept(motion, checkpoint, settings)
@@ -101,8 +98,7 @@ def edit_motion(
         "samples": settings.samples,
         "guidance": guidance,
         "rule": settings.rule,
-        "av_offset_s": offset_s,
-        "av_offset_of": motion.provenance.get("av_offset_of", []),
+        **{name: motion.provenance[name] for name in OFFSET if name in motion.provenance},
         "edit": _as_json(path, kept, settings),
     }
     face = checkpoint.regions["face"]
@@ -160,15 +156,12 @@ def _with_keyframes(motion: Motion, source: Path, keyframes: NDArray[np.bool_]) 
     return with_frames(motion, other, keyframes, places)
 
 
-def _sound_of(speech: Path, motion: Motion, encoder: SpeechEncoder) -> tuple[F32, F32, float]:
-    """Sound [S] at 48 kHz from the motion's first frame on, the speech features [N, W] of its frames, and its offset.
-
-    The offset, s, is how late the sound is against the motion: it was measured with that of the run, and other people's
-    sound has none.
-    """
+def _sound_of(speech: Path, motion: Motion, encoder: SpeechEncoder, report: Reporter) -> tuple[F32, F32]:
+    """Sound [S] at 48 kHz from the motion's first frame on, and the speech features [N, W] of its frames."""
     sound, start_s = read_speech(speech)
-    own = sha256_file(speech) in motion.provenance.get("av_offset_of", [])
-    offset_s = motion.av_offset_s if own else 0.0
+    offset_s = motion.sound_offset_s(sha256_file(speech))
+    if not offset_s and motion.provenance.get("av_offset_s"):
+        report.say(f"{speech}: another sound than the motion's own, whose offset is not applied")
     times = motion.start_s + offset_s + np.arange(len(motion.valid)) / motion.fps
     end_s = start_s + len(sound) / FILM_RATE
     if end_s < times[-1] - SOUND_SLACK_S:
@@ -177,7 +170,7 @@ def _sound_of(speech: Path, motion: Motion, encoder: SpeechEncoder) -> tuple[F32
         )
     length_s = len(times) / motion.fps
     features = speech_features(speech, times, encoder)
-    return on_video_clock(sound, start_s - times[0], length_s, FILM_RATE), features, offset_s
+    return on_video_clock(sound, start_s - times[0], length_s, FILM_RATE), features
 
 
 def _as_json(path: Path, kept: Kept, settings: EditSettings) -> dict[str, object]:

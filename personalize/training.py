@@ -223,14 +223,16 @@ def _motion_sequence(
     motion: Motion, basis: MotionBasis, sound: Path, encoder: SpeechEncoder, style: int
 ) -> Sequence:
     """The motion in the new basis, with its sound, which is as late as its run found it."""
-    times = motion.start_s + motion.av_offset_s + np.arange(len(motion.valid)) / motion.fps
+    times = (
+        motion.start_s + motion.sound_offset_s(sha256_file(sound)) + np.arange(len(motion.valid)) / motion.fps
+    )
     coefficients = motion.coefficients @ basis.coefficients(motion.basis)
     return Sequence(coefficients, speech_features(sound, times, encoder), motion.valid, style)
 
 
 def _training_key(settings: TrainSettings, speech: SpeechEncoder, files: Iterable[Path]) -> str:
     """Hash of what decides the trained model, and its scores: the settings, the speech encoder and the data's files."""
-    data = [(path.name, sha256_file(path)) for path in sorted(files)]
+    data = sorted((path.name, sha256_file(path)) for path in files)
     return sha256_json([settings.iterations, settings.seed, settings.architecture, speech.name, data])
 
 
@@ -246,12 +248,14 @@ def _work_folder(out: Path, key: str, first: bool) -> Path:
     key_file = work / "key"
     try:
         work.mkdir(parents=True, exist_ok=True)
-        begun = key_file.read_text() if key_file.is_file() else key
-        if first:
-            write_text(key_file, begun)
+        # What ended before it made anything may be begun anew.
+        begun = any(path.is_file() for path in work.glob("*/*"))
+        other = begun and not (key_file.is_file() and key_file.read_bytes() == key.encode())
+        if first and not other:
+            write_text(key_file, key)
     except OSError as error:
         raise UserError(f"{work}: cannot be written ({error.strerror}); choose another --out") from None
-    if begun != key:
+    if other:
         raise UserError(
             f"{work}: holds a training with other settings or data; give another --out, or delete this folder"
         )

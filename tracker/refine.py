@@ -69,7 +69,7 @@ def refine_track(
     each row of the landmarks; a long clip's are read twice. A frame whose skin does not come nearer to what it should
     look like keeps its landmark fit, and so does one whose picture is missing. bundle: its poses, turned as far as
     they and the landmarks tell together, are taken where skin looks as much alike from frame to frame under them,
-    in part where it hardly looks less so; they end halfway between what grey levels and the bundle tell.
+    in part where it hardly looks less so; after the grey levels they go half of that way once more.
     evidence: see `fit_track`.
     What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips and by how the
     lips move (tracker/lip_opening.py, tracker/lip_motion.py), depth by how the skin shifts in a turn

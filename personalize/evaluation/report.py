@@ -138,7 +138,7 @@ def _sound_offset(registration: dict[str, Any]) -> str:
     if registration["av_offset_sure"]:
         done = "corrected"
     else:
-        done = f"{'small' if abs(found_s) <= SMALLEST_S else 'not sure'}, left as it is"
+        done = f"{'small' if 0 < abs(found_s) <= SMALLEST_S else 'not sure'}, left as it is"  # 0: nothing was found
     return f"{found_s * 1000:+.0f} ms ({done})"
 
 

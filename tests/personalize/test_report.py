@@ -8,6 +8,7 @@ from personalize.evaluation.report import _sound_offset
 @pytest.mark.parametrize(
     ("found_s", "sure", "says"),
     [
+        (0.0, False, "+0 ms (not sure, left as it is)"),  # of silence
         (0.012, False, "+12 ms (small, left as it is)"),
         (-0.06, False, "-60 ms (small, left as it is)"),
         (0.07, False, "+70 ms (not sure, left as it is)"),

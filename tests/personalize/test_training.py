@@ -25,6 +25,7 @@ from model.trainer import TrainingDivergedError
 from model.training_config import TrainingConfig
 from personalize import protocol
 from personalize.errors import UserError
+from personalize.files import sha256_file
 from personalize.mouth import mouth_regions
 from personalize.protocol import METRICS, SYSTEMS, Reference, first_seconds, with_noise
 from personalize.reporter import Reporter
@@ -157,6 +158,15 @@ def test_tracked_motions_train_too(
     replace(motion, coefficients=motion.coefficients[::-1]).save(folder / "bob.npz")
     with pytest.raises(UserError, match="other settings or data; give another --out, or delete this folder"):
         train(tmp_path / "base.safetensors", motions=folder, iterations=4)
+    sound = (folder / "bob.wav").read_bytes()
+    (folder / "bob.wav").write_bytes(b"none")
+    with pytest.raises(UserError, match=r"bob\.wav"):
+        train(tmp_path / "mended.safetensors", motions=folder, iterations=4)
+    (folder / "bob.wav").write_bytes(sound)
+    train(tmp_path / "mended.safetensors", motions=folder, iterations=4)  # nothing had been begun
+    (tmp_path / "mended.safetensors.work/key").write_bytes(b"\xff\xfe")
+    with pytest.raises(UserError, match="other settings or data"):
+        train(tmp_path / "mended.safetensors", motions=folder, iterations=4)
     (folder / "bob.wav").unlink()
     with pytest.raises(UserError, match=r"bob\.wav is missing"):
         train(tmp_path / "other.safetensors", motions=folder, iterations=4)
@@ -166,9 +176,12 @@ def test_a_motions_sound_is_as_late_as_its_run_found_it(fake: FakeVocaset, tmp_p
     folder = write_motions(fake, tmp_path / "motions")
     motion, encoder = Motion.load(folder / "anna.npz"), load_encoder()
     basis = motion_basis(lambda: [motion.displacements()], modes=8)
-    late = replace(motion, provenance={"av_offset_s": 0.2})
-    found = [_motion_sequence(m, basis, folder / "anna.wav", encoder, 0).features for m in (motion, late)]
+    late = {"av_offset_s": 0.2, "av_offset_of": [sha256_file(folder / "anna.wav")]}
+    others = late | {"av_offset_of": ["another file's"]}
+    motions = (motion, replace(motion, provenance=late), replace(motion, provenance=others))
+    found = [_motion_sequence(m, basis, folder / "anna.wav", encoder, 0).features for m in motions]
     np.testing.assert_allclose(found[1][:-6], found[0][6:], atol=1e-4)
+    np.testing.assert_array_equal(found[2], found[0])
 
 
 @pytest.mark.parametrize(
