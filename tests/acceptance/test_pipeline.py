@@ -97,7 +97,7 @@ def test_run_folder_holds_what_design_says(talk: Path, finished: Path) -> None:
     assert checkpoint.kind == "subject" and checkpoint.topology == motion.topology
     assert len(motion.valid) == pytest.approx(SECONDS * 30, abs=2)
     heard = [sha256_file(path) for path in (talk, finished / "ingest/audio.wav")]
-    assert motion.provenance["av_offset_of"] == heard and motion.av_offset_s == 0
+    assert motion.provenance["av_offset_of"] == heard and motion.provenance["av_offset_s"] == 0
 
 
 def test_the_track_is_near_the_truth(talk: Path, finished: Path) -> None:
