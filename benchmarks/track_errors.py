@@ -12,7 +12,7 @@ from kornia.geometry import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, minimum_filter1d
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
+from scipy.sparse.csgraph import maximum_bipartite_matching
 from scipy.spatial import cKDTree
 from scipy.stats import rankdata
 from torch import from_numpy
@@ -160,9 +160,8 @@ def middle_of_lips(head: HeadModel) -> tuple[NDArray[np.integer], NDArray[np.int
     """Vertices of the upper and of the lower lip in the face's middle, from their outer rims to the mouth's inside."""
     lips = head.regions["lips"]
     middle = lips[np.abs(head.template[lips, 0]) < MIDDLE_M]
-    sides = head.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    sides = sides[np.isin(sides, middle).all(1)]
-    part = connected_components(csr_array((np.ones(len(sides)), sides.T), 2 * (len(head.template),)))[1]
+    sides = trimesh.geometry.faces_to_edges(head.faces)
+    part = trimesh.graph.connected_component_labels(sides[np.isin(sides, middle).all(1)], len(head.template))
     lines = (head.regions[f"inner_lip_{lip}"] for lip in ("upper", "lower"))
     upper, lower = (middle[part[middle] == part[line[len(line) // 2]]] for line in lines)
     return upper, lower

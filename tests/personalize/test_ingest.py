@@ -1,16 +1,15 @@
-"""Shots, people, usable time and the split; on whole clips where shared ones are there."""
+"""Which frames of a clip are used and why others are not; on whole clips where shared ones are there."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 from unittest.mock import Mock
 
-import cv2
 import numpy as np
 import pytest
 
@@ -27,38 +26,18 @@ from personalize.ingest import (
     ingest_video,
 )
 from personalize.people import (
-    OTHER_PERSON,
-    FaceFollower,
-    Look,
-    Sighting,
     Tracklet,
-    main_person,
-    sharpness,
-    sureness_of_turns,
 )
 from personalize.pictures import FrameReader
 from personalize.shots import (
-    REASONS,
-    Changes,
     Frames,
-    difference,
     find_shots,
     repeated,
-    sudden,
-    thumbnail,
-    usable_seconds,
 )
-from personalize.split import make_split
+from tests.personalize.people_factory import frames_of, tracklet
 from tests.personalize.video_factory import RATE, clicks, moving, write_video
-from tracker.face_detector import Face
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.track import F32
-
-
-def frames_of(time: np.ndarray, usable: np.ndarray, segment: np.ndarray | None = None) -> Frames:
-    shots = np.zeros(len(time), np.int32) if segment is None else segment.astype(np.int32)
-    box = np.zeros((len(time), 4), np.float32)
-    return Frames(time, usable, (~usable).astype(np.uint8), REASONS, shots, box)
 
 
 def follow_one(
@@ -82,53 +61,6 @@ def test_pictures_of_an_unusual_form_are_told(resized_s: float, interlaced: int,
     media = SimpleNamespace(width=96, height=64)
     texts = _form(media, SimpleNamespace(resized_s=resized_s, interlaced=interlaced), 25)
     assert len(texts) == len(said) and all(words in text for words, text in zip(said, texts))
-
-
-def test_a_cut_is_found_where_the_change_stands_out() -> None:
-    change = 0.5 + 0.2 * np.sin(np.arange(100.0))
-    change[[30, 33, 70]] = 8.0
-    shots = find_shots(np.arange(100) / 25, change)
-    assert list(np.flatnonzero(np.diff(shots)) + 1) == [30, 33, 70]
-
-
-def test_steady_strong_motion_is_no_cut() -> None:
-    change = np.random.default_rng(0).uniform(4, 8, 200)
-    assert find_shots(np.arange(200) / 25, change).max() == 0
-
-
-def test_a_missing_second_ends_a_shot_and_a_dropped_frame_does_not() -> None:
-    time = np.concatenate([np.arange(25) / 25, 2 + np.arange(25) / 25])
-    time = np.delete(time, 40)
-    change = np.full(len(time), 1.0)
-    change[40] = 4.0  # two steps at once
-    assert list(np.flatnonzero(np.diff(find_shots(time, change))) + 1) == [25]
-
-
-def test_a_repeated_picture_is_seen_and_a_small_motion_is_not_one() -> None:
-    grey = np.random.default_rng(0).integers(0, 255, (36, 64), dtype=np.uint8)
-    moved = grey.copy()
-    moved[10:12, 10:12] ^= 8
-    assert difference(grey, grey)[1] and not difference(moved, grey)[1]
-
-
-def test_a_small_face_that_moves_in_a_still_picture_repeats_nothing() -> None:
-    screen = np.random.default_rng(0).integers(0, 255, (720, 1280, 3), dtype=np.uint8)
-    moved, face = screen.copy(), np.array([1100, 600, 1130, 640], np.float32)
-    moved[628:631, 1112:1116] ^= 31  # a mouth
-    changes = Changes()
-    assert changes.next(screen, face) == ((0.0, False), (0.0, False))
-    (whole, same), (near, alike) = changes.next(moved, face)
-    assert same and not alike and near > 10 * whole
-    assert changes.next(moved, face) == ((0.0, True), (0.0, True))
-    # What changes elsewhere counts as well: another slide, of which the still face sees nothing.
-    slide = moved.copy()
-    slide[:300, :600] = 255
-    other, (near, alike) = changes.next(slide, face)
-    assert (near, alike) == other and near > 10 and not alike
-    changes.next(moved, face)
-    # A large face is a large part of the picture.
-    whole_only = changes.next(screen, np.array([200, 100, 900, 700], np.float32))
-    assert whole_only[0] == whole_only[1] == (whole, True)
 
 
 def test_how_closely_is_looked_is_decided_once_for_a_clip(
@@ -155,118 +87,10 @@ def test_how_closely_is_looked_is_decided_once_for_a_clip(
         assert (set(looked.pop()), set(looked.pop())) == ({cuts}, {repeats})
 
 
-@pytest.mark.parametrize(
-    ("rate", "new", "of"), [(30, 1, 2), (30, 4, 5), (60, 1, 2), (60, 1, 3), (60, 1, 4), (60, 1, 5)]
-)
-def test_pictures_that_are_repeated_and_coded_anew_are_seen(rate: int, new: int, of: int) -> None:
-    random, time = np.random.default_rng(0), np.arange(200) / rate
-    change = random.uniform(0.6, 1.4, 200)
-    again = np.arange(200) % of >= new
-    change[again] = random.uniform(0.02, 0.08, again.sum())
-    nothing = np.zeros(200, bool)
-    np.testing.assert_array_equal(repeated(time, change, nothing)[5:-5], again[5:-5])
-    still = random.uniform(0.02, 0.08, 200)
-    assert not repeated(time, still, nothing).any()
-    assert repeated(time, still, again).sum() == again.sum()
-
-
-def test_in_a_clip_that_repeats_pictures_more_of_the_small_changes_are_repeats() -> None:
-    random, time = np.random.default_rng(0), np.arange(600) / 60
-    again, change, nothing = np.arange(600) % 2 == 1, random.uniform(0.3, 0.7, 600), np.zeros(600, bool)
-    slow = change.copy()
-    change[again] = random.uniform(0.03, 0.13, again.sum())
-    assert repeated(time, change, nothing)[again].mean() > 0.98
-    assert not repeated(time, change, nothing)[~again].any()
-    slow[::40] = 0.11  # where nothing else is repeated, a moment of rest is none
-    assert not repeated(time, slow, nothing).any()
-
-
-def test_the_first_picture_and_a_still_one_repeat_nothing() -> None:
-    change, nothing = np.ones(50), np.zeros(50, bool)
-    change[0] = 0
-    change[20:30] = 0
-    assert not repeated(np.arange(50) / 25, change, nothing).any()
-
-
-def test_a_rest_of_a_fifth_of_a_second_is_no_repeated_picture() -> None:
-    change = np.where(np.arange(100) % 25 < 5, 0.05, 1.0)
-    assert not repeated(np.arange(100) / 25, change, np.zeros(100, bool)).any()
-
-
 def test_broken_time_stamps_take_no_more_memory_than_whole_ones() -> None:
     time = np.arange(3000) / 90_000
     assert find_shots(time, np.ones(3000)).max() == 0
     assert not repeated(time, np.ones(3000), np.zeros(3000, bool)).any()
-
-
-def test_usable_time_bridges_repeated_frames_but_not_cuts() -> None:
-    time = np.arange(100) / 50
-    every_other = np.arange(100) % 2 == 0
-    assert usable_seconds(frames_of(time, every_other)) == pytest.approx(2.0, abs=0.05)
-    lost = (time < 0.5) | (time >= 1.5)
-    assert usable_seconds(frames_of(time, lost)) == pytest.approx(1.0, abs=0.03)
-    assert usable_seconds(frames_of(time, np.zeros(100, bool))) == 0
-
-
-def test_split_is_two_to_one_to_one_in_time_and_disjoint() -> None:
-    time = np.arange(3000) / 25
-    usable = (time < 20) | (time > 40)  # 100 s
-    split = make_split(frames_of(time, usable))
-    seconds = {k: sum(b - a for a, b in split[k]) for k in ("train", "val", "test")}
-    assert split["usable_seconds"] == pytest.approx(100, abs=0.2)
-    assert seconds == pytest.approx({"train": 50, "val": 25, "test": 25}, abs=0.5)
-    assert split["train"][0] == [0.0, pytest.approx(20, abs=0.05)]
-    assert split["val"][0][0] - split["train"][-1][1] >= 0.15
-    assert split["test"][0][0] - split["val"][-1][1] >= 0.15
-
-
-def test_split_moves_to_a_cut_nearby() -> None:
-    time = np.arange(1000) / 25
-    segment = (time >= 20.8).astype(int)
-    split = make_split(frames_of(time, np.ones(1000, bool), segment))
-    assert split["train"][-1][1] == pytest.approx(20.8, abs=0.05)
-    assert split["val"][0][0] == pytest.approx(20.8, abs=0.05)
-
-
-def tracklet(
-    person: int,
-    frames: Iterable[int],
-    width: float = 50,
-    seed: int = 0,
-    light: float = 120.0,
-    burnt: float = 0.0,
-) -> Tracklet:
-    """A face whose shape and portrait are those of `person`, with some noise and in another pose."""
-    own, noise = np.random.default_rng(person), np.random.default_rng(seed + 1000)
-    shape = np.random.default_rng(99).normal(size=(478, 3)) + 0.15 * own.normal(size=(478, 3))
-    portrait = own.integers(0, 255, (14, 12))
-    sample = (
-        (100 * (shape + 0.01 * noise.normal(size=shape.shape)) + 7).astype(np.float32),
-        (0.7 * portrait + noise.integers(0, 20, portrait.shape)).astype(np.uint8),
-    )
-    box = np.array([0, 0, width, width], np.float32)
-    return Tracklet(
-        [Sighting(f, f / 25, box.copy(), 60.0, light, burnt, 0.5, None if f % 10 else sample) for f in frames]
-    )
-
-
-def test_the_person_most_in_the_picture_is_kept_over_cuts() -> None:
-    mine = [tracklet(1, range(0, 50)), tracklet(1, range(100, 160), seed=1)]
-    other = [tracklet(2, range(50, 100))]
-    kept, left = main_person([*other, *mine])
-    assert {id(t) for t in kept} == {id(t) for t in mine} and left == other
-
-
-def test_one_of_two_people_seen_together_is_kept() -> None:
-    together = [tracklet(1, range(0, 50)), tracklet(2, range(0, 50), width=80)]
-    kept, left = main_person(together)
-    assert kept == [together[1]] and left == [together[0]]
-
-
-def test_what_the_landmarker_never_took_for_a_face_is_nobody() -> None:
-    ghost = tracklet(1, range(1, 10))
-    assert not ghost.shapes
-    assert main_person([ghost]) == ([], [])
 
 
 def test_no_sound_silence_and_no_face_are_named(tmp_path: Path) -> None:
@@ -303,22 +127,6 @@ def test_a_face_that_lies_on_its_side_is_refused(
             find_usable(probe(path))
     else:
         assert find_usable(probe(path))[0].usable.any()
-
-
-@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
-def test_a_face_is_found_most_surely_where_it_is_turned_upright(quarters: int) -> None:
-    def detect(rgb: np.ndarray) -> list[Face]:
-        """A face whose hair is bright and above; less sure of one whose hair is elsewhere."""
-        sides = [rgb[0, 30, 0], rgb[30, 0, 0], rgb[-1, 30, 0], rgb[30, -1, 0]]
-        box, points = np.zeros(4, np.float32), np.zeros((6, 2), np.float32)
-        return [Face(box, points, 0.9 if np.argmax(sides) == 0 else 0.6)]
-
-    picture = np.zeros((60, 60, 3), np.uint8)
-    picture[:20] = 200
-    box = np.array([20, 20, 40, 40], np.float32)
-    # np.rot90 turns to the left, as the looks do.
-    sure = sureness_of_turns(Mock(detect=detect), np.rot90(picture, -quarters), box)
-    assert sure.argmax() == quarters and np.sort(sure)[:3].tolist() == [0.6] * 3
 
 
 @pytest.mark.parametrize(
@@ -432,119 +240,6 @@ def test_hard_compression_is_told_by_how_large_the_face_is(
     follow_one(monkeypatch, tracklet(1, range(20)))  # 60 px between the eyes
     _, warnings = find_usable(probe(path))
     assert any(f"quantizer {steps} of 51, 60 px" in text for text in warnings) == told
-
-
-def test_how_much_of_a_face_is_cut_off_is_measured() -> None:
-    picture = np.full((480, 640, 3), 255, np.uint8)  # before a white wall
-    picture[100:300, 120:280] = 90
-    picture[150:225, 120:280] = (255, 252, 120)
-    face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
-    landmarker = Mock(detect=lambda rgb: [face], landmarks=lambda *_: (np.zeros((478, 3)), 0.0, None))
-    follower = FaceFollower(landmarker)
-    follower.add(0, 0.0, picture)
-    assert follower.tracklets[0].sightings[0].burnt == pytest.approx(1 / 3, abs=0.02)
-
-
-def test_small_faces_that_are_found_near_each_other_are_followed_once_each() -> None:
-    boxes = np.float32([[100, 100, 130, 130], [140, 100, 170, 130]])
-    down, right = np.mgrid[:256, :256].astype(np.uint8)
-    picture = np.stack([right, down, down], axis=-1)  # each pixel says where it is
-
-    def detect(rgb: np.ndarray, tiled: bool = False) -> list[Face]:
-        """Both faces, but in the whole picture only where tiles are searched."""
-        if rgb.shape == picture.shape and not tiled:
-            return []
-        corner = np.tile(rgb[0, 0, :2].astype(np.float32), 2)
-        return [Face(box - corner, np.zeros((6, 2), np.float32), 0.9) for box in boxes]
-
-    follower = FaceFollower(Mock(detect=detect, landmarks=lambda *_: (np.zeros((478, 3)), 0.0, None)))
-    for index in range(12):
-        follower.add(index, index / 25, picture)
-    assert [len(tracklet.frames) for tracklet in follower.tracklets] == [12, 12]
-
-
-def test_behind_a_cut_a_face_is_looked_at_anew_however_shortly_it_is_seen() -> None:
-    face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
-    points = np.random.default_rng(0).normal(200, 40, (478, 3)).astype(np.float32)
-    landmarker = Mock(landmarks=lambda *_: (points, 0.9, None))
-    follower, picture = FaceFollower(landmarker), np.full((480, 640, 3), 90, np.uint8)
-    gone = {33, *range(36, 60)}  # the first picture behind the cut, and soon for good
-    for index in range(60):
-        landmarker.detect = lambda *_, index=index, **__: [] if index in gone else [face]
-        follower.add(index, index / 25, picture, sudden=index == 33)
-    (followed,) = follower.tracklets
-    before, behind = followed.shots((np.arange(60) >= 33).astype(np.int32))
-    assert before.frames == list(range(33)) and behind.frames == [34, 35]
-    assert len(before.shapes) == 3 and len(behind.shapes) == 1
-
-
-@pytest.mark.parametrize(("gone", "jump_px", "tracklets"), [(10, 0, 1), (11, 0, 2), (0, 50, 1), (0, 120, 2)])
-def test_a_face_that_is_soon_seen_again_nearly_where_it_was_is_the_same(
-    gone: int, jump_px: float, tracklets: int
-) -> None:
-    """Of 200 px; ten pictures are .4 s from the last sight of it."""
-    follower, picture = (
-        FaceFollower(Mock(landmarks=lambda *_: (None, 0.0, None))),
-        np.zeros((480, 640, 3), np.uint8),
-    )
-    for index in range(40):
-        box = np.float32([100, 100, 300, 300]) + np.float32([jump_px, 0, jump_px, 0]) * (index >= 20)
-        seen = [] if 20 <= index < 20 + gone - 1 else [Face(box, np.zeros((6, 2), np.float32), 0.9)]
-        follower._landmarker.detect = lambda *_, seen=seen, **__: seen
-        follower.add(index, index / 25, picture)
-    assert len(follower.tracklets) == tracklets
-
-
-def test_people_are_told_apart_by_the_shape_of_the_face_and_by_how_the_head_looks() -> None:
-    """Either is enough; a pose, a size and other light are not."""
-    one, other = tracklet(1, range(0, 30)), tracklet(2, range(40, 70))
-    pose = np.asarray(one.shapes[0], np.float64)
-
-    def mixed(shape: Tracklet, portrait: Tracklet, light: float = 1.0) -> Look:
-        made = tracklet(1, range(80, 110))
-        turn = np.array([[0.0, -1.3, 0.0], [1.3, 0.0, 0.0], [0.0, 0.0, 1.3]])
-        samples = [(s @ turn, light * p) for s, p in zip(shape.shapes, portrait.portraits)]
-        made.sightings = [replace(made.sightings[0], sample=sample) for sample in samples]
-        return Look.of(made, pose)
-
-    look = Look.of(one, pose)
-    assert look.distance(mixed(one, one, 0.5)) < 0.2
-    assert look.distance(mixed(other, one)) > OTHER_PERSON / 2
-    assert look.distance(mixed(one, other)) > OTHER_PERSON / 2
-    apart = look.distance(mixed(other, one)) + look.distance(mixed(one, other))
-    assert look.distance(mixed(other, other)) == pytest.approx(apart, abs=0.1)
-
-
-def test_of_two_faces_alike_that_are_seen_together_one_is_the_person() -> None:
-    """As in a mirror, or a picture on the wall."""
-    mine = [tracklet(1, range(0, 50)), tracklet(1, range(60, 100), seed=1)]
-    mirrored = tracklet(1, range(60, 90), seed=2, width=30)
-    kept, left = main_person([mirrored, *mine])
-    assert {id(t) for t in kept} == {id(t) for t in mine} and left == [mirrored]
-
-
-def test_how_sharp_a_face_is_does_not_hang_on_its_contrast() -> None:
-    grey = np.random.default_rng(0).integers(0, 255, (64, 64)).astype(np.uint8)
-    assert sharpness(grey // 3 + 90) == pytest.approx(sharpness(grey), rel=0.05)
-    assert sharpness(cv2.GaussianBlur(grey, (0, 0), 2.0)) < 0.2 * sharpness(grey)
-
-
-def test_what_may_be_a_cut_holds_every_cut() -> None:
-    random = np.random.default_rng(1)
-    for scale in (0.2, 1.0, 4.0):
-        change = random.gamma(1.0, scale, 400)
-        change[random.choice(400, 12, replace=False)] += 12.0
-        first = np.flatnonzero(np.diff(find_shots(np.arange(400) / 25, change))) + 1
-        assert len(first) > 3
-        assert all(sudden(change[i], change[max(i - 7, 0) : i]) for i in first)
-
-
-def test_what_moves_in_the_dark_is_no_repeated_picture() -> None:
-    dark = np.full((480, 640, 3), 11, np.uint8)
-    moved = dark.copy()
-    moved[200:206, 300:310] = 13  # one of ten by ten pixels by 1.2 levels, which rounding would make 1
-    assert not difference(thumbnail(moved), thumbnail(dark))[1]
-    assert difference(thumbnail(dark), thumbnail(dark))[1]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,152 @@
+"""Faces followed through a clip, told apart, and the person among them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from unittest.mock import Mock
+
+import cv2
+import numpy as np
+import pytest
+
+from personalize.people import (
+    OTHER_PERSON,
+    FaceFollower,
+    Look,
+    Tracklet,
+    main_person,
+    sharpness,
+    sureness_of_turns,
+)
+from tests.personalize.people_factory import tracklet
+from tracker.face_detector import Face
+
+
+def test_the_person_most_in_the_picture_is_kept_over_cuts() -> None:
+    mine = [tracklet(1, range(0, 50)), tracklet(1, range(100, 160), seed=1)]
+    other = [tracklet(2, range(50, 100))]
+    kept, left = main_person([*other, *mine])
+    assert {id(t) for t in kept} == {id(t) for t in mine} and left == other
+
+
+def test_one_of_two_people_seen_together_is_kept() -> None:
+    together = [tracklet(1, range(0, 50)), tracklet(2, range(0, 50), width=80)]
+    kept, left = main_person(together)
+    assert kept == [together[1]] and left == [together[0]]
+
+
+def test_what_the_landmarker_never_took_for_a_face_is_nobody() -> None:
+    ghost = tracklet(1, range(1, 10))
+    assert not ghost.shapes
+    assert main_person([ghost]) == ([], [])
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_a_face_is_found_most_surely_where_it_is_turned_upright(quarters: int) -> None:
+    def detect(rgb: np.ndarray) -> list[Face]:
+        """A face whose hair is bright and above; less sure of one whose hair is elsewhere."""
+        sides = [rgb[0, 30, 0], rgb[30, 0, 0], rgb[-1, 30, 0], rgb[30, -1, 0]]
+        box, points = np.zeros(4, np.float32), np.zeros((6, 2), np.float32)
+        return [Face(box, points, 0.9 if np.argmax(sides) == 0 else 0.6)]
+
+    picture = np.zeros((60, 60, 3), np.uint8)
+    picture[:20] = 200
+    box = np.array([20, 20, 40, 40], np.float32)
+    # np.rot90 turns to the left, as the looks do.
+    sure = sureness_of_turns(Mock(detect=detect), np.rot90(picture, -quarters), box)
+    assert sure.argmax() == quarters and np.sort(sure)[:3].tolist() == [0.6] * 3
+
+
+def test_how_much_of_a_face_is_cut_off_is_measured() -> None:
+    picture = np.full((480, 640, 3), 255, np.uint8)  # before a white wall
+    picture[100:300, 120:280] = 90
+    picture[150:225, 120:280] = (255, 252, 120)
+    face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
+    landmarker = Mock(detect=lambda rgb: [face], landmarks=lambda *_: (np.zeros((478, 3)), 0.0, None))
+    follower = FaceFollower(landmarker)
+    follower.add(0, 0.0, picture)
+    assert follower.tracklets[0].sightings[0].burnt == pytest.approx(1 / 3, abs=0.02)
+
+
+def test_small_faces_that_are_found_near_each_other_are_followed_once_each() -> None:
+    boxes = np.float32([[100, 100, 130, 130], [140, 100, 170, 130]])
+    down, right = np.mgrid[:256, :256].astype(np.uint8)
+    picture = np.stack([right, down, down], axis=-1)  # each pixel says where it is
+
+    def detect(rgb: np.ndarray, tiled: bool = False) -> list[Face]:
+        """Both faces, but in the whole picture only where tiles are searched."""
+        if rgb.shape == picture.shape and not tiled:
+            return []
+        corner = np.tile(rgb[0, 0, :2].astype(np.float32), 2)
+        return [Face(box - corner, np.zeros((6, 2), np.float32), 0.9) for box in boxes]
+
+    follower = FaceFollower(Mock(detect=detect, landmarks=lambda *_: (np.zeros((478, 3)), 0.0, None)))
+    for index in range(12):
+        follower.add(index, index / 25, picture)
+    assert [len(tracklet.frames) for tracklet in follower.tracklets] == [12, 12]
+
+
+def test_behind_a_cut_a_face_is_looked_at_anew_however_shortly_it_is_seen() -> None:
+    face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
+    points = np.random.default_rng(0).normal(200, 40, (478, 3)).astype(np.float32)
+    landmarker = Mock(landmarks=lambda *_: (points, 0.9, None))
+    follower, picture = FaceFollower(landmarker), np.full((480, 640, 3), 90, np.uint8)
+    gone = {33, *range(36, 60)}  # the first picture behind the cut, and soon for good
+    for index in range(60):
+        landmarker.detect = lambda *_, index=index, **__: [] if index in gone else [face]
+        follower.add(index, index / 25, picture, sudden=index == 33)
+    (followed,) = follower.tracklets
+    before, behind = followed.shots((np.arange(60) >= 33).astype(np.int32))
+    assert before.frames == list(range(33)) and behind.frames == [34, 35]
+    assert len(before.shapes) == 3 and len(behind.shapes) == 1
+
+
+@pytest.mark.parametrize(("gone", "jump_px", "tracklets"), [(10, 0, 1), (11, 0, 2), (0, 50, 1), (0, 120, 2)])
+def test_a_face_that_is_soon_seen_again_nearly_where_it_was_is_the_same(
+    gone: int, jump_px: float, tracklets: int
+) -> None:
+    """Of 200 px; ten pictures are .4 s from the last sight of it."""
+    follower, picture = (
+        FaceFollower(Mock(landmarks=lambda *_: (None, 0.0, None))),
+        np.zeros((480, 640, 3), np.uint8),
+    )
+    for index in range(40):
+        box = np.float32([100, 100, 300, 300]) + np.float32([jump_px, 0, jump_px, 0]) * (index >= 20)
+        seen = [] if 20 <= index < 20 + gone - 1 else [Face(box, np.zeros((6, 2), np.float32), 0.9)]
+        follower._landmarker.detect = lambda *_, seen=seen, **__: seen
+        follower.add(index, index / 25, picture)
+    assert len(follower.tracklets) == tracklets
+
+
+def test_people_are_told_apart_by_the_shape_of_the_face_and_by_how_the_head_looks() -> None:
+    """Either is enough; a pose, a size and other light are not."""
+    one, other = tracklet(1, range(0, 30)), tracklet(2, range(40, 70))
+    pose = np.asarray(one.shapes[0], np.float64)
+
+    def mixed(shape: Tracklet, portrait: Tracklet, light: float = 1.0) -> Look:
+        made = tracklet(1, range(80, 110))
+        turn = np.array([[0.0, -1.3, 0.0], [1.3, 0.0, 0.0], [0.0, 0.0, 1.3]])
+        samples = [(s @ turn, light * p) for s, p in zip(shape.shapes, portrait.portraits)]
+        made.sightings = [replace(made.sightings[0], sample=sample) for sample in samples]
+        return Look.of(made, pose)
+
+    look = Look.of(one, pose)
+    assert look.distance(mixed(one, one, 0.5)) < 0.2
+    assert look.distance(mixed(other, one)) > OTHER_PERSON / 2
+    assert look.distance(mixed(one, other)) > OTHER_PERSON / 2
+    apart = look.distance(mixed(other, one)) + look.distance(mixed(one, other))
+    assert look.distance(mixed(other, other)) == pytest.approx(apart, abs=0.1)
+
+
+def test_of_two_faces_alike_that_are_seen_together_one_is_the_person() -> None:
+    """As in a mirror, or a picture on the wall."""
+    mine = [tracklet(1, range(0, 50)), tracklet(1, range(60, 100), seed=1)]
+    mirrored = tracklet(1, range(60, 90), seed=2, width=30)
+    kept, left = main_person([mirrored, *mine])
+    assert {id(t) for t in kept} == {id(t) for t in mine} and left == [mirrored]
+
+
+def test_how_sharp_a_face_is_does_not_hang_on_its_contrast() -> None:
+    grey = np.random.default_rng(0).integers(0, 255, (64, 64)).astype(np.uint8)
+    assert sharpness(grey // 3 + 90) == pytest.approx(sharpness(grey), rel=0.05)
+    assert sharpness(cv2.GaussianBlur(grey, (0, 0), 2.0)) < 0.2 * sharpness(grey)
