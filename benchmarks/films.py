@@ -78,7 +78,7 @@ def shoot(scene: Scene, head: HeadModel, path: Path) -> GroundTruth:
     """Render a scene to the video `path`."""
     person, moves = mouth.furnished(stranger(head, scene)), scene_motion(scene)
     weights = moves.expression_for(person.expression_names)
-    studio = _Studio(scene, person, moves)
+    studio = Studio(scene, person, moves)
     covered, gaps = np.zeros(len(weights)), np.zeros(len(weights))
     with VideoWriter(path, FPS, scene.size, crf=scene.crf) as writer:
         for frame, weight in enumerate(weights):
@@ -100,7 +100,7 @@ def shoot(scene: Scene, head: HeadModel, path: Path) -> GroundTruth:
     )
 
 
-class _Studio:
+class Studio:
     """Light, paint, props, background, lens and sensor of one scene."""
 
     def __init__(self, scene: Scene, person: HeadModel, moves: TalkerMotion) -> None:

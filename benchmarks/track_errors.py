@@ -21,6 +21,7 @@ from benchmarks.ground_truth import GroundTruth
 from personalize.settings import Settings
 from tracker.head import HeadModel
 from tracker.raster import project, vertex_normals
+from tracker.similarity import similarity
 from tracker.track import F64, Track
 
 NORMAL_M = 0.01  # two points whose normals differ by a unit count as this far apart
@@ -33,7 +34,7 @@ RECOVERED = 1.5  # times the median error
 STILL_M = 1e-5  # a head that moves by less stands still
 
 Bool = NDArray[np.bool_]
-Similarity = tuple[float, F64, F64]
+Similarity = tuple[F64, F64, F64]
 
 
 def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, float]:
@@ -250,23 +251,13 @@ def turn(rotation: F64) -> float:
     return float(_angle_deg(rotation @ _mean_rotation(rotation).T).max())
 
 
-def similarity(source: F64, target: F64, scaled: bool = True) -> Similarity:
-    """Least-squares (scale, rotation [3, 3], shift [3]) with target = scale * rotation source + shift."""
-    a, b = source - source.mean(0), target - target.mean(0)
-    u, size, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
-    turned = (u * sign) @ vt
-    scale = float((size * sign).sum() / (a**2).sum()) if scaled else 1.0
-    return scale, turned, target.mean(0) - scale * turned @ source.mean(0)
-
-
 def _align(source: F64, truth: GroundTruth) -> Similarity:
     """Similarity between head frames whose axes point alike, by nearest points of source [n, 3] m and the truth.
 
     The farthest fifth does not count: the two heads do not end at the same rim.
     """
     spread = [np.linalg.norm(points - points.mean(0), axis=1).mean() for points in (truth.neutral, source)]
-    scale, turned = float(spread[0] / spread[1]), np.eye(3)
+    scale, turned = np.asarray(spread[0] / spread[1]), np.eye(3)
     shift = truth.neutral.mean(0) - scale * source.mean(0)
     tree = cKDTree(truth.neutral)
     for _ in range(40):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from personalize.pictures import FrameReader
 from personalize.shots import Frames
 from tracker.feature_tracks import FeatureFollower, FeatureTracks
+from tracker.landmark_bias import landmark_bias
 from tracker.landmarker import track_landmarks
 from tracker.occlusion import Appearance, FaceWatch
 from tracker.track import Landmarks
@@ -28,4 +30,5 @@ def read_face(
         progress=progress,
         watchers=(watch, follower),
     )
+    landmarks = replace(landmarks, points=landmark_bias().taken_out(landmarks.points, frames.usable))
     return landmarks, watch.appearance(frames.usable), follower.tracks()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+import tracker.landmark_bias
 import tracker.landmarker
 from model.speech import load_encoder
 from personalize import run as files
@@ -34,6 +35,7 @@ from tracker.fit import fit_track
 from tracker.refine import Refined, refine_track
 
 JUDGED = ("refine/track.npz", "refine/quality.csv")
+LANDMARK_BIAS_FILE = tracker.landmark_bias.ASSET
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
 
 
@@ -70,11 +72,14 @@ class Ingest(Stage):
 class LandmarkStage(Stage):
     """478 points and 52 scores on every frame that shows the face, what covers or blurs it, and rigid features."""
 
-    name, version = "landmarks", 7
+    name, version = "landmarks", 8
     needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz", "features.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
-        return {"face_landmarker": _asset_hash(LANDMARKER_FILE)}
+        return {
+            "face_landmarker": _asset_hash(LANDMARKER_FILE),
+            "landmark_bias": _asset_hash(LANDMARK_BIAS_FILE),
+        }
 
     def make(self, context: Context, folder: Path) -> None:
         frames = files.read_frames(context.run.path / "ingest/frames.npz")

@@ -21,6 +21,7 @@ from tracker.head import HeadModel, LandmarkEmbedding
 from tracker.key_frames import farthest
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, STEADY_CORNERS, UPPER_FACE
 from tracker.rigid_surface import SurfacePoints, surface_points
+from tracker.similarity import similarity
 from tracker.track import F64, Bundle, Camera, Landmarks
 
 PRIOR_FOCAL = 1.3  # of the picture's long side: phones and webcams .7-1.2, camcorders and portraits 1.2-2.5
@@ -262,13 +263,7 @@ def _similarity(source: F64, target: F64) -> tuple[F64, float, F64]:
     """
     near = np.ones(len(source), bool)
     for _ in range(5):
-        centre, goal = source[near].mean(0), target[near].mean(0)
-        a, b = source[near] - centre, target[near] - goal
-        u, size, vt = np.linalg.svd(b.T @ a)
-        sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
-        turn = (u * sign) @ vt
-        scale = float((size * sign).sum() / (a**2).sum())
-        shift = goal - scale * turn @ centre
+        scale, turn, shift = similarity(source[near], target[near])
         departure = np.linalg.norm(scale * source @ turn.T + shift - target, axis=1)
         near = departure <= 2.5 * np.median(departure)
-    return turn, scale, shift
+    return turn, float(scale), shift

@@ -26,6 +26,7 @@ from tracker.energy import (
 )
 from tracker.gaze import eye_rotations
 from tracker.key_frames import KeyFrames, key_frames
+from tracker.similarity import similarity
 from tracker.solver import Smoothness, solve_frames, solve_subject
 from tracker.track import F32, F64, Camera, Landmarks, Track, TrackError
 
@@ -100,15 +101,10 @@ def _start(
 ) -> tuple[Energy, F64]:
     """The clip's energy, and poses of the mean head by Procrustes against the landmarker's own depth [n, 478] px."""
     seen = np.concatenate([observed, depth[..., None]], axis=2)[:, model.landmarks]
-    centre = seen.mean(1, keepdims=True)
-    covariance = (seen - centre).transpose(0, 2, 1) @ model.mean
-    u, size, vt = np.linalg.svd(covariance)
-    sign = np.ones((len(seen), 3))
-    sign[:, 2] = np.linalg.det(u @ vt)
-    matrix = (u * sign[:, None]) @ vt
-    px_per_m = (size * sign).sum(1) / (model.mean**2).sum()
+    px_per_m, matrix, _ = similarity(np.broadcast_to(model.mean, seen.shape), seen)
+    centre = seen.mean(1)
     principal = np.array(camera.principal_px, np.float64)
-    ray = np.concatenate([centre[:, 0, :2] - principal, np.full((len(seen), 1), camera.focal_px)], axis=1)
+    ray = np.concatenate([centre[:, :2] - principal, np.full((len(seen), 1), camera.focal_px)], axis=1)
     translation = ray / px_per_m[:, None]
     rotation = rotation_vector(matrix)
     x = np.concatenate([np.zeros((len(seen), model.expressions)), rotation, translation], axis=1)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.films import MADE_BY, _Studio, film, film_key, shoot
+from benchmarks.films import MADE_BY, Studio, film, film_key, shoot
 from benchmarks.ground_truth import GroundTruth
 from benchmarks.rendered_heads import SCENES, SPEECH, Scene, scene_motion, stranger
 from personalize.pictures import FrameReader
@@ -67,7 +67,7 @@ def test_hand_covers_the_mouth_for_half_a_second(tmp_path: Path, monkeypatch: py
 def test_lips_outside_the_picture_count_as_covered(shift: tuple[float, float, float]) -> None:
     person, moves = furnished(stranger(load_head(), SCENE)), scene_motion(SCENE)
     away = replace(moves, translation=moves.translation + np.float32(shift))
-    picture, covered = _Studio(SCENE, person, away).picture(0, person.template)
+    picture, covered = Studio(SCENE, person, away).picture(0, person.template)
     assert covered == 1 and picture.shape == (640, 640, 3)
 
 
@@ -76,7 +76,7 @@ def test_no_motion_blurs_across_a_cut() -> None:
     person, moves = furnished(stranger(load_head(), scene)), scene_motion(scene)
     moves.translation[5:, 0] += 0.05
     ended = replace(moves, **{name: getattr(moves, name)[:5] for name in MOVING})
-    whole, alone = (_Studio(scene, person, seen).picture(4, person.template)[0] for seen in (moves, ended))
+    whole, alone = (Studio(scene, person, seen).picture(4, person.template)[0] for seen in (moves, ended))
     np.testing.assert_array_equal(whole, alone)
 
 

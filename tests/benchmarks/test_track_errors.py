@@ -17,7 +17,6 @@ from benchmarks.track_errors import (
     opening_errors,
     recovery_frames,
     separation,
-    similarity,
     surface_error,
 )
 from tracker.head import HeadModel, load_head
@@ -248,16 +247,6 @@ def test_recovery_counts_from_the_end_of_a_disturbance() -> None:
     error = np.array([1, 1, 1, 9, 9, 5, 4, 1, 9, 1, 1, 1.0])
     assert recovery_frames(error, disturbed) == 2
     assert np.isnan(recovery_frames(error, np.zeros(12, bool)))
-
-
-def test_similarity_is_found_exactly() -> None:
-    random = np.random.default_rng(1)
-    source, turned = random.normal(size=(9, 3)), Rotation.random(random_state=2).as_matrix()
-    scale, found, shift = similarity(source, 2 * source @ turned.T + [1, 2, 3])
-    assert scale == pytest.approx(2)
-    np.testing.assert_allclose(found, turned, atol=1e-9)
-    np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-9)
-    assert similarity(source, 2 * source, scaled=False)[0] == 1
 
 
 def test_covered_frames_do_not_count(exact: tuple[Track, GroundTruth], head: HeadModel) -> None:

@@ -6,12 +6,12 @@ from unittest.mock import MagicMock, Mock
 import numpy as np
 import pytest
 
-from benchmarks.track_errors import similarity
 from tests.tracker.test_photometric import HEAD, IDENTITY, energy_and_x  # noqa: F401
 from tests.tracker.test_refine import filmed, freckled
 from tracker import skin_identity
 from tracker.appearance import HARMONICS
 from tracker.photometric import PhotometricEnergy
+from tracker.similarity import similarity
 from tracker.skin_identity import SubjectEnergy, nearer_to_skin
 
 Case = tuple[SubjectEnergy, np.ndarray, np.ndarray]
