@@ -15,12 +15,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tracker.energy import LID_PAIRS, LIP_PAIRS
 from tracker.similarity import similarity
 from tracker.track import F32, F64
 
 ASSET = Path(__file__).parent / "assets" / "landmark_bias.npz"
 FARTHEST_TURN = 0.5  # rad; what was not seen when the map was learned errs as the farthest that was
 FARTHEST_SCORE = 3.0  # standard deviations
+# An opening between lips or lids that is read wider errs as the map tells; skin that touches cannot come nearer.
+OPEN_M = 0.004
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,12 @@ class LandmarkBias:
             axis=1,
         )
         errors = np.tensordot(features, self.rate, axes=1) @ axes * scale[:, None, None]
+        upper, lower = np.array([*LIP_PAIRS, *LID_PAIRS]).T
+        apart = np.linalg.norm(out[known][:, upper, :2] - out[known][:, lower, :2], axis=2)
+        shut = np.clip(1 - apart / (OPEN_M * scale[:, None]), 0, 1)[..., None]
+        together = shut * (errors[:, upper] - errors[:, lower]) / 2
+        errors[:, upper] -= together
+        errors[:, lower] += together
         out[known, :, :2] -= errors.astype(np.float32)
         return out
 

@@ -1,5 +1,7 @@
 """What landmarks err by as a face turns and moves: by hand, then read on rendered heads whose turn is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -93,6 +95,19 @@ def test_what_was_never_seen_errs_as_the_farthest_that_was(bias: LandmarkBias) -
     assert np.linalg.norm(moved[4, 11]) == pytest.approx(
         PX_PER_M * FARTHEST_SCORE * np.hypot(0.001, 0.002), rel=1e-3
     )
+
+
+@pytest.mark.parametrize(("opening_mm", "share"), [(0.0, 0.0), (1.0, 0.25), (6.0, 1.0)])
+def test_skin_that_touches_is_not_brought_nearer(bias: LandmarkBias, opening_mm: float, share: float) -> None:
+    """Errors of an opening count the less the narrower it is read; what its two sides err by alike counts always."""
+    rate = np.zeros_like(bias.rate)
+    rate[0, 13], rate[0, 14] = (0.01, 0.03), (0.01, -0.01)
+    turned = _seen(bias, 0.3)
+    turned[14] = turned[13] + [0, opening_mm, 0]
+    clip = np.stack([_seen(bias)] * 3 + [turned])
+    moved = clip - replace(bias, rate=rate).taken_out(clip, np.ones(4, bool))
+    np.testing.assert_allclose(moved[3, 13, :2], [3, 3 + 6 * share], atol=0.05)
+    np.testing.assert_allclose(moved[3, 14, :2], [3, 3 - 6 * share], atol=0.05)
 
 
 def test_without_a_face_nothing_is_taken_out(bias: LandmarkBias) -> None:
