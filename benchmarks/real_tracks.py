@@ -1,7 +1,7 @@
 """What can be told of tracks of real clips: `python -m benchmarks real_tracks RUN [RUN ...]`.
 
-The runs must have come as far as `judge`. There is no truth: the landmarks' own opening is what the eye would say
-first, and wrong in its own way.
+The runs must have come as far as `judge`. There is no truth: the landmarks' own opening (called raw below,
+though what landmarks are known to err by is taken out) is what the eye would say first, and wrong in its own way.
 
 used        frames in use, by quality.csv; all below is of these
 r, slope    of the lip opening with the raw landmarks', of the landmark fit and refined

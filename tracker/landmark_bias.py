@@ -24,6 +24,7 @@ FARTHEST_TURN = 0.5  # rad; what was not seen when the map was learned errs as t
 FARTHEST_SCORE = 3.0  # standard deviations
 # An opening between lips or lids that is read wider errs as the map tells; skin that touches cannot come nearer.
 OPEN_M = 0.004
+TOGETHER = 1000  # frames, to bound memory
 
 
 @dataclass(frozen=True)
@@ -66,29 +67,35 @@ class LandmarkBias:
         (the median) stays.
         """
         out = points.copy()
-        known = np.isfinite(points).all(axis=(1, 2))
-        telling = usable[known]
-        if not telling.any():
+        known = np.flatnonzero(np.isfinite(points).all(axis=(1, 2)))
+        if not usable[known].any():
             return out
-        turns, shapes, scale, axes = self.seen(points[known])
-        turns, shapes = (part - np.median(part[telling], axis=0) for part in (turns, shapes))
-        scores = np.tensordot(shapes, self.modes, axes=((1, 2), (1, 2)))
-        features = np.concatenate(
-            [
-                np.clip(turns, -FARTHEST_TURN, FARTHEST_TURN),
-                np.clip(scores, -FARTHEST_SCORE, FARTHEST_SCORE),
-            ],
-            axis=1,
-        )
+        parts = np.array_split(known, range(TOGETHER, len(known), TOGETHER))
+        features = np.concatenate([self._features(points[rows]) for rows in parts])
+        features -= np.median(features[usable[known]], axis=0)
+        limit = np.repeat([FARTHEST_TURN, FARTHEST_SCORE], [2, len(self.modes)])
+        features = np.clip(features, -limit, limit)
+        for rows in parts:
+            mine = features[np.searchsorted(known, rows)]
+            out[rows, :, :2] -= self._errors(points[rows], mine).astype(np.float32)
+        return out
+
+    def _features(self, points: NDArray[np.floating]) -> F64:
+        """[n, 2 + K] turns, rad, and scores of faces."""
+        turns, shapes, _, _ = self.seen(points)
+        return np.concatenate([turns, np.tensordot(shapes, self.modes, axes=((1, 2), (1, 2)))], axis=1)
+
+    def _errors(self, points: NDArray[np.floating], features: F64) -> F64:
+        """[n, 478, 2] px that the points err by, told by the features' departures [n, 2 + K] from the usual."""
+        _, _, scale, axes = self.seen(points)
         errors = np.tensordot(features, self.rate, axes=1) @ axes * scale[:, None, None]
         upper, lower = np.array([*LIP_PAIRS, *LID_PAIRS]).T
-        apart = np.linalg.norm(out[known][:, upper, :2] - out[known][:, lower, :2], axis=2)
+        apart = np.linalg.norm(points[:, upper, :2] - points[:, lower, :2], axis=2)
         shut = np.clip(1 - apart / (OPEN_M * scale[:, None]), 0, 1)[..., None]
         together = shut * (errors[:, upper] - errors[:, lower]) / 2
         errors[:, upper] -= together
         errors[:, lower] += together
-        out[known, :, :2] -= errors.astype(np.float32)
-        return out
+        return errors
 
 
 @cache

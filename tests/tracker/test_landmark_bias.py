@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.tracker.test_landmarker import CENTRE, FACING, FOCAL, SIZE
 from tools.build_landmark_bias import View, learn, left_over
+from tracker import landmark_bias as landmark_bias_module
 from tracker.head import HeadModel, load_head
 from tracker.landmark_bias import FARTHEST_SCORE, FARTHEST_TURN, LandmarkBias, landmark_bias
 from tracker.landmark_indices import MIRRORED, POINTS
@@ -122,6 +123,14 @@ def test_without_a_face_nothing_is_taken_out(bias: LandmarkBias) -> None:
         bias.taken_out(clip[3:4], used[:1]), clip[3:4]
     )  # one frame is its own middle
     np.testing.assert_array_equal(bias.taken_out(clip, ~used), clip)  # no frame tells how the face usually is
+
+
+def test_a_long_clip_is_put_right_as_a_short_one(bias: LandmarkBias, monkeypatch: pytest.MonkeyPatch) -> None:
+    clip = np.stack([_seen(bias, 0.03 * k, 0.02 * k) for k in range(7)])
+    clip[2] = np.nan
+    whole = bias.taken_out(clip, np.ones(7, bool))
+    monkeypatch.setattr(landmark_bias_module, "TOGETHER", 2)
+    np.testing.assert_array_equal(bias.taken_out(clip, np.ones(7, bool)), whole)
 
 
 def test_frames_of_others_do_not_tell_how_the_face_usually_is(bias: LandmarkBias) -> None:
