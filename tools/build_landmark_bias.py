@@ -22,7 +22,7 @@ from benchmarks.films import Studio
 from benchmarks.rendered_heads import scene_motion, stranger
 from benchmarks.strangers import drawn
 from personalize.render import mouth
-from tracker.energy import FACING, IRISES, SLIDING
+from tracker.energy import FACING, IRISES
 from tracker.head import HeadModel, load_head
 from tracker.landmark_bias import ASSET, LandmarkBias
 from tracker.landmark_indices import MIRRORED, POINTS, UPPER_FACE
@@ -37,7 +37,7 @@ RIDGE = 0.1  # of each feature's own square sum: what is read is noise in part
 SIZE = 640
 ROLL_DEG, YAW_DEG, NOD_DEG = 5.0, 25.0, 16.0  # to either side
 SHIFT_M = 0.01  # sd
-# Share of the views in which a shape counts, and up to how much then.
+# Share of the views in which a shape counts, and up to how much then; one side of it differs by UNLIKE.
 SHAPES: dict[str, tuple[float, float]] = {
     "jawOpen": (0.7, 0.5),
     **{
@@ -64,7 +64,8 @@ UNLIKE = 0.3  # how far the sides of a face may differ, as a share
 
 @dataclass(frozen=True)
 class View:
-    """One picture read. points: [478, 3] px. off: [478, 2] m, right and down as the face is held; NaN off the skin."""
+    """One picture read. points: [478, 3] px. off: [478, 2] m, right and down as the face is held; NaN for those that
+    have no place on the head."""
 
     person: int
     points: F32
@@ -151,27 +152,30 @@ def about_person(values: F64, person: F64) -> F64:
 def learn(head: HeadModel, views: list[View]) -> LandmarkBias:
     """The map that tells the views' errors best."""
     embedding = head.landmark_embedding
-    landmarks = np.setdiff1d(embedding.landmarks, [*SLIDING, *IRISES]).astype(np.int32)
+    landmarks = np.setdiff1d(embedding.landmarks, IRISES).astype(np.int32)
     mean = head.landmark_positions(np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis)))
     mean = mean[np.searchsorted(embedding.landmarks, landmarks)]
-    nothing = np.zeros((0, len(landmarks), 3), np.float32), np.zeros((2, POINTS, 2), np.float32)
-    bias = LandmarkBias(landmarks, np.isin(landmarks, UPPER_FACE), mean, *nothing)
+    none = np.zeros((2, 0), np.float32)
+    bias = LandmarkBias(
+        landmarks, np.isin(landmarks, UPPER_FACE), mean, np.zeros((0, *mean.shape)), none, none
+    )
     views = views + [view.mirrored() for view in views]
-    person = np.array([view.person for view in views])
-    turns, shapes, *_ = bias.seen(np.array([view.points for view in views]))
+    person, points = (np.array([getattr(view, name) for view in views]) for name in ("person", "points"))
+    turns, shapes, *_ = bias.seen(points)
     turns, flat = about_person(turns, person), about_person(shapes.reshape(len(views), -1), person)
-    of_turns = turns @ np.linalg.lstsq(turns, flat, rcond=None)[0]
-    _, size, modes = np.linalg.svd(flat - of_turns, full_matrices=False)
+    of_turn = np.linalg.lstsq(turns, flat, rcond=None)[0]
+    _, size, modes = np.linalg.svd(flat - turns @ of_turn, full_matrices=False)
     modes = modes[:MODES] * np.sqrt(len(views)) / size[:MODES, None]
-    features = np.concatenate([turns, flat @ modes.T], axis=1)
+    bias = replace(
+        bias,
+        modes=modes.reshape(-1, *mean.shape).astype(np.float32),
+        of_turn=(of_turn @ modes.T).astype(np.float32),
+    )
+    features = about_person(bias.features(points)[0], person)
     off = about_person(np.array([view.off for view in views]).reshape(len(views), -1), person)
     square = features.T @ features
     rate = np.linalg.solve(square + RIDGE * np.diag(np.diag(square)), features.T @ np.nan_to_num(off))
-    return replace(
-        bias,
-        modes=modes.reshape(-1, len(landmarks), 3).astype(np.float32),
-        rate=rate.reshape(-1, POINTS, 2).astype(np.float32),
-    )
+    return replace(bias, rate=rate.reshape(-1, POINTS, 2).astype(np.float32))
 
 
 def left_over(bias: LandmarkBias, views: list[View]) -> tuple[F64, F64]:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.tracker.test_landmarker import CENTRE, FACING, FOCAL, SIZE
-from tools.build_landmark_bias import View, learn, left_over
+from tools.build_landmark_bias import View, about_person, learn, left_over
 from tracker import landmark_bias as landmark_bias_module
 from tracker.head import HeadModel, load_head
 from tracker.landmark_bias import FARTHEST_SCORE, FARTHEST_TURN, LandmarkBias, landmark_bias
@@ -31,8 +31,9 @@ def bias() -> LandmarkBias:
     mean = np.random.default_rng(1).normal(size=(30, 3)).astype(np.float32) * 0.04
     modes, rate = np.zeros((1, 30, 3), np.float32), np.zeros((3, POINTS, 2), np.float32)
     modes[0, 25, 2] = 1 / 0.002
+    of_turn = np.array([[0.5], [-0.3]], np.float32)
     rate[0, 7], rate[1, 9], rate[2, 11] = (0.02, 0.01), (0.03, -0.04), (0.001, 0.002)
-    return LandmarkBias(SEEN, STEADY, mean, modes, rate)
+    return LandmarkBias(SEEN, STEADY, mean, modes, of_turn, rate)
 
 
 def _towards(yaw: float, nod: float) -> np.ndarray:
@@ -83,19 +84,21 @@ def test_errors_are_taken_out_along_the_face(bias: LandmarkBias, roll: float) ->
     axes = np.array([[np.cos(roll), np.sin(roll)], [-np.sin(roll), np.cos(roll)]])
     np.testing.assert_allclose(moved[3, 7, :2] @ axes.T, [-6.0, -3.0], atol=1e-2)  # .3 rad of 20 and 10 px
     np.testing.assert_allclose(moved[3, 9, :2] @ axes.T, [6.0, -8.0], atol=1e-2)
-    np.testing.assert_allclose(moved[3, 11, :2] @ axes.T, [-2.0, -4.0], atol=1e-2)  # two deviations
+    score = 0.004 / 0.002 - (0.3 * 0.5 + 0.2 * 0.3)  # less what goes with the turn
+    np.testing.assert_allclose(moved[3, 11, :2] @ axes.T, [-score, -2 * score], atol=1e-2)
     assert np.abs(np.delete(moved[3], (7, 9, 11), axis=0)).max() < 1e-3 and np.abs(moved[..., 2]).max() == 0
 
 
 def test_what_was_never_seen_errs_as_the_farthest_that_was(bias: LandmarkBias) -> None:
-    clip = np.stack([_seen(bias)] * 3 + [_seen(bias, 1.2), _seen(bias, pushed=0.03)])
+    clip = np.stack([_seen(bias)] * 3 + [_seen(bias, 1.2), _seen(bias, 0, 0.9), _seen(bias, pushed=0.03)])
     moved = bias.taken_out(clip, np.ones(len(clip), bool)) - clip
-    assert np.linalg.norm(moved[3, 7]) == pytest.approx(
-        PX_PER_M * FARTHEST_TURN * np.hypot(0.02, 0.01), rel=1e-3
-    )
-    assert np.linalg.norm(moved[4, 11]) == pytest.approx(
-        PX_PER_M * FARTHEST_SCORE * np.hypot(0.001, 0.002), rel=1e-3
-    )
+    for frame, point, farthest, rate in (
+        (3, 7, FARTHEST_TURN[0], (0.02, 0.01)),
+        (4, 9, FARTHEST_TURN[1], (0.03, -0.04)),
+        (5, 11, FARTHEST_SCORE, (0.001, 0.002)),
+    ):
+        expected = PX_PER_M * farthest * np.hypot(*rate)
+        assert np.linalg.norm(moved[frame, point]) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(("opening_mm", "share"), [(0.0, 0.0), (1.0, 0.25), (6.0, 1.0)])
@@ -123,6 +126,9 @@ def test_without_a_face_nothing_is_taken_out(bias: LandmarkBias) -> None:
         bias.taken_out(clip[3:4], used[:1]), clip[3:4]
     )  # one frame is its own middle
     np.testing.assert_array_equal(bias.taken_out(clip, ~used), clip)  # no frame tells how the face usually is
+    clip[1] = 5.0  # no face's points
+    np.testing.assert_array_equal(bias.taken_out(clip, used)[1], clip[1])
+    np.testing.assert_array_equal(bias.taken_out(clip, used)[[0, 2, 3, 4]], out[[0, 2, 3, 4]])
 
 
 def test_a_long_clip_is_put_right_as_a_short_one(bias: LandmarkBias, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,21 +149,30 @@ def test_frames_of_others_do_not_tell_how_the_face_usually_is(bias: LandmarkBias
 def test_a_map_is_learned_again(head: HeadModel) -> None:
     """From views made by one, but for a tenth, which the ridge takes off."""
     random = np.random.default_rng(3)
-    learned = learn(head, _made(head, random, 40))
-    turns = learned.rate[:2]
-    np.testing.assert_allclose(turns[0, 4], [0.01 / 1.1, 0], atol=3e-4)
-    np.testing.assert_allclose(turns[1, 4], [0, -0.02 / 1.1], atol=3e-4)
+    views = _made(head, random, 40)
+    learned = learn(head, views)
+    np.testing.assert_allclose(learned.rate[0, 4], [0.01 / 1.1, 0], atol=3e-4)
+    np.testing.assert_allclose(learned.rate[1, 4], [0, -0.02 / 1.1], atol=3e-4)
     before, after = left_over(learned, _made(head, random, 10))
     assert (after < 0.2 * before).all()
+    # What goes with the turn alone is no score: those are of deviation one, and stay within the limit.
+    person, points = (np.array([getattr(view, name) for view in views]) for name in ("person", "points"))
+    features = about_person(learned.features(points)[0], person)
+    scores = features[:, 2:]
+    np.testing.assert_allclose(scores[:, 0].std(), 1, atol=0.15)
+    assert (
+        np.abs(np.corrcoef(features.T)[:2, 2]).max() < 0.2 and (np.abs(scores) > FARTHEST_SCORE).mean() < 0.02
+    )
 
 
 def _made(head: HeadModel, random: np.random.Generator, people: int) -> list[View]:
-    """Views of rigid heads, the nose tip of which slides with their turns."""
+    """Views of heads whose chin is read elsewhere when they turn, and moves; the nose tip errs with their turns."""
     embedding = head.landmark_embedding
     where = np.zeros((POINTS, 3))
     where[embedding.landmarks] = head.landmark_positions(
         np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis))
     )
+    chin = 0.01 * (where[:, 1:2] < where[:, 1].mean() - 0.04)
     views = []
     for person in range(1, people + 1):
         shape = where + 0.002 * random.normal(size=where.shape)
@@ -167,7 +182,8 @@ def _made(head: HeadModel, random: np.random.Generator, people: int) -> list[Vie
             off = np.full((POINTS, 2), np.nan)
             off[embedding.landmarks] = 0.0
             off[4] = 0.01 * yaw, -0.02 * nod
-            moving = shape + 0.0005 * random.normal(size=where.shape)
+            moving = shape + 0.0001 * random.normal(size=where.shape)
+            moving += chin * (random.normal() * np.array([0, 0.2, 0]) + yaw * np.array([2, 0, 0]))
             views.append(View(person, (PX_PER_M * moving @ turn.T).astype(np.float32), off))
     return views
 
