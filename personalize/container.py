@@ -71,8 +71,8 @@ class Source:
     """An opened container: of what can be decoded its `video` stream, None where there is none, and its `sounds`.
 
     Of several video streams it is the one that players show, or the largest. A phone may put sound of a format of its
-    own before, or behind, one that others can read. `lost`: how many packets of the video FFmpeg refused so
-    far.
+    own before, or behind, one that others can read. `lost`: how many packets of the video FFmpeg
+    refused so far.
 
     It reads through one file handle with no protocols allowed, so that a playlist cannot open other files.
     """

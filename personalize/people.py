@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tracker.face_detector import Face, merged
 from tracker.landmarker import FaceLandmarker, roi_from_face
+from tracker.similarity import similarity
 
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
@@ -213,9 +214,8 @@ def align(shapes: F64, reference: F64) -> F64:
     """Shapes [N, 478, 3] centred, scaled to norm 1 and turned onto `reference` [478, 3]."""
     shapes = shapes - shapes.mean(1, keepdims=True)
     shapes = shapes / np.sqrt((shapes**2).sum((1, 2), keepdims=True))
-    u, _, vt = np.linalg.svd(np.einsum("nki,kj->nij", shapes, reference))
-    u[..., -1] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    return np.einsum("nki,nij->nkj", shapes, u @ vt)
+    _, rotation, _ = similarity(shapes, reference)
+    return shapes @ rotation.transpose(0, 2, 1)
 
 
 @dataclass(frozen=True)

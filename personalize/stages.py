@@ -35,7 +35,6 @@ from tracker.fit import fit_track
 from tracker.refine import Refined, refine_track
 
 JUDGED = ("refine/track.npz", "refine/quality.csv")
-LANDMARK_BIAS_FILE = tracker.landmark_bias.ASSET
 LANDMARKER_FILE = Path(tracker.landmarker.__file__).parent / "assets" / "face_landmarker.task"
 
 
@@ -78,7 +77,7 @@ class LandmarkStage(Stage):
     def assets(self, settings: Settings) -> dict[str, str]:
         return {
             "face_landmarker": _asset_hash(LANDMARKER_FILE),
-            "landmark_bias": _asset_hash(LANDMARK_BIAS_FILE),
+            "landmark_bias": _asset_hash(tracker.landmark_bias.ASSET),
         }
 
     def make(self, context: Context, folder: Path) -> None:

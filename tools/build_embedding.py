@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from tracker.head import ASSET, HeadModel, LandmarkEmbedding, read_head
 from tracker.landmark_indices import LEFT_EYE, MIRRORED, RIGHT_EYE
-from tracker.landmarker import FaceLandmarker, roi_from_face, roi_from_points
+from tracker.landmarker import MIN_PRESENCE, FaceLandmarker, roi_from_face, roi_from_points
 from tracker.raster import project, rasterize, render
 
 F32 = NDArray[np.float32]
@@ -77,14 +77,20 @@ def look(head: HeadModel, count: int, yaws_deg: tuple[float, ...], seed: int) ->
             vertices = head.vertices(identity, np.zeros(len(head.expression_basis))) @ turn.T
             vertices = vertices * TO_CAMERA + np.array([0, 0, DISTANCE], np.float32)
             picture = render(vertices, head.faces, tint, FOCAL, CENTRE, (SIZE, SIZE))
-            faces = landmarker.detect(picture)
-            if not faces:
-                continue
-            points, presence, _ = landmarker.landmarks(picture, roi_from_face(faces[0]))
-            points, presence, _ = landmarker.landmarks(picture, roi_from_points(points))
-            if presence > 0.5:
+            points = read(landmarker, picture)
+            if points is not None:
                 views.append(View(vertices, points[:, :2]))
     return views
+
+
+def read(landmarker: FaceLandmarker, picture: NDArray[np.uint8]) -> F32 | None:
+    """Landmarks [478, 3] px of the face in a picture, in the region that a film's later frames have; None without."""
+    faces = landmarker.detect(picture)
+    if not faces:
+        return None
+    points, _, _ = landmarker.landmarks(picture, roi_from_face(faces[0]))
+    points, presence, _ = landmarker.landmarks(picture, roi_from_points(points))
+    return points if presence > MIN_PRESENCE else None
 
 
 def carry_back(head: HeadModel, view: View) -> F64:

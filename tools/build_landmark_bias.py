@@ -22,11 +22,12 @@ from benchmarks.films import Studio
 from benchmarks.rendered_heads import scene_motion, stranger
 from benchmarks.strangers import drawn
 from personalize.render import mouth
+from tools.build_embedding import read
 from tracker.energy import FACING, IRISES
 from tracker.head import HeadModel, load_head
 from tracker.landmark_bias import ASSET, LandmarkBias
 from tracker.landmark_indices import MIRRORED, POINTS, UPPER_FACE
-from tracker.landmarker import FaceLandmarker, roi_from_face, roi_from_points
+from tracker.landmarker import FaceLandmarker
 from tracker.raster import project
 from tracker.track import F32, F64
 
@@ -113,12 +114,8 @@ def look(number: int) -> list[View]:
     for view in range(VIEWS):
         vertices = person.vertices(np.zeros(1), weights[view], eyes=eyes[view])
         picture, _ = studio.picture(view, vertices)
-        faces = landmarker.detect(picture)
-        if not faces:
-            continue
-        points, _, _ = landmarker.landmarks(picture, roi_from_face(faces[0]))
-        points, presence, _ = landmarker.landmarks(picture, roi_from_points(points))
-        if presence > 0.5:
+        points = read(landmarker, picture)
+        if points is not None:
             off = off_place(head, vertices @ rotation[view].T + translation[view], points, scene.focal * SIZE)
             down = -rotation[view, :2, 1] / np.linalg.norm(rotation[view, :2, 1])
             views.append(View(number, points, off @ np.array([[down[1], down[0]], [-down[0], down[1]]])))

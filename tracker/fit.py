@@ -101,7 +101,7 @@ def _start(
 ) -> tuple[Energy, F64]:
     """The clip's energy, and poses of the mean head by Procrustes against the landmarker's own depth [n, 478] px."""
     seen = np.concatenate([observed, depth[..., None]], axis=2)[:, model.landmarks]
-    px_per_m, matrix, _ = similarity(np.broadcast_to(model.mean, seen.shape), seen)
+    px_per_m, matrix, _ = similarity(model.mean, seen)
     centre = seen.mean(1)
     principal = np.array(camera.principal_px, np.float64)
     ray = np.concatenate([centre[:, :2] - principal, np.full((len(seen), 1), camera.focal_px)], axis=1)

@@ -55,8 +55,7 @@ class LandmarkBias:
         """
         face = points[:, self.landmarks].astype(np.float64)
         upper = face[:, self.steady]
-        mean = np.broadcast_to(self.mean[self.steady].astype(np.float64), upper.shape)
-        scale, rotation, _ = similarity(mean, upper)
+        scale, rotation, _ = similarity(self.mean[self.steady].astype(np.float64), upper)
         shapes = (face - upper.mean(1, keepdims=True)) @ rotation / scale[:, None, None]
         x, y, z = -rotation[:, 2].T
         down = -rotation[:, :2, 1] / np.linalg.norm(rotation[:, :2, 1], axis=1, keepdims=True)
@@ -87,9 +86,8 @@ class LandmarkBias:
         for rows, (features, scale, axes) in zip(parts, looks):
             departure = np.clip(features - usual, -farthest, farthest)
             errors = np.tensordot(departure, self.rate, axes=1) @ axes * scale[:, None, None]
-            out[rows, :, :2] -= _less_where_shut(errors, points[rows, :, :2], OPEN_M * scale).astype(
-                np.float32
-            )
+            errors = _less_where_shut(errors, points[rows, :, :2], OPEN_M * scale)
+            out[rows, :, :2] -= errors.astype(np.float32)
         return out
 
 

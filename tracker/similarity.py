@@ -10,7 +10,8 @@ from tracker.track import F64
 def similarity(source: F64, target: F64, scaled: bool = True) -> tuple[F64, F64, F64]:
     """Scale [..], rotation [.., 3, 3] and shift [.., 3] with target = scale * rotation source + shift.
 
-    source, target: [.., n, 3]. In the least squares, and never a mirror image (Umeyama 1991). scaled: else of scale 1.
+    source, target: [.., n, 3], which may be one for all. In the least squares, and never a mirror image (Umeyama 1991).
+    scaled: else of scale 1.
     """
     a, b = (points - points.mean(-2, keepdims=True) for points in (source, target))
     u, size, vt = np.linalg.svd(np.swapaxes(b, -1, -2) @ a)
