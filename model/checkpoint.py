@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -25,6 +25,8 @@ from model.motion import FPS, topology_hash
 SCHEMA = "1"
 Kind = Literal["base", "subject"]
 State = dict[str, Tensor]
+# Without these nothing can be measured, drawn or kept.
+NEEDED_REGIONS = ("lips", "face", "inner_lip_upper", "inner_lip_lower")
 
 
 @dataclass(frozen=True)
@@ -166,7 +168,7 @@ class Checkpoint:
             raise ModelError(
                 f"{path} is damaged or incomplete as a checkpoint ({reason}); make it again"
             ) from error
-        if checkpoint.topology != metadata["topology"]:
+        if checkpoint.topology != metadata.get("topology"):
             raise ModelError(f"{path} is damaged: its mesh is not the one its topology names; make it again")
         if topology is not None and checkpoint.topology != topology:
             raise ModelError(
@@ -192,9 +194,9 @@ def _assemble(tensors: dict[str, Tensor], metadata: dict[str, str]) -> Checkpoin
             name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)
         }
 
-    kind = metadata["kind"]
-    if kind not in ("base", "subject"):
-        raise ValueError(f"kind {kind!r}")
+    for name, known in (("kind", Kind), ("schedule", Schedule), ("parametrization", Parametrization)):
+        if metadata[name] not in get_args(known):
+            raise ValueError(f"{name} {metadata[name]!r}")
     config = NetworkConfig(**json.loads(metadata["network"]))
     statistics = {name: value.numpy() for name, value in group("standardization.").items()}
     # Before there was a spread, the skip took it as one.
@@ -212,8 +214,11 @@ def _assemble(tensors: dict[str, Tensor], metadata: dict[str, str]) -> Checkpoin
     shapes = {standardization.scale.shape, standardization.spread.shape, standardization.mean.shape}
     if shapes != {(config.coefficients,)} or not (standardization.scale > 0).all():
         raise ValueError("mean, scale or spread of the coefficients")
+    shapes = {standardization.audio_mean.shape, standardization.audio_scale.shape}
+    if shapes != {(config.audio_width,)} or not (standardization.audio_scale > 0).all():
+        raise ValueError("mean or scale of the speech features")
     checkpoint = Checkpoint(
-        kind="base" if kind == "base" else "subject",
+        kind="base" if metadata["kind"] == "base" else "subject",
         encoder=metadata["encoder"],
         styles=styles,
         config=config,
@@ -230,8 +235,29 @@ def _assemble(tensors: dict[str, Tensor], metadata: dict[str, str]) -> Checkpoin
         guidance=float(metadata["guidance"]),
         provenance=json.loads(metadata["provenance"]),
     )
-    checkpoint.model()  # every weight is there and has its shape
+    _check_values(checkpoint)
+    with torch.device("meta"):  # a file may claim sizes that no memory holds
+        network = build_network(config)
+    for state in (checkpoint.network, checkpoint.ema):
+        network.load_state_dict(state, assign=True)  # every weight is there and has its shape
     return checkpoint
+
+
+def _check_values(checkpoint: Checkpoint) -> None:
+    """ValueError where a mesh names what is not there, a region is missing, or a number is none."""
+    indices = {"faces": checkpoint.faces, **checkpoint.regions}
+    for name, values in indices.items():
+        if values.dtype.kind not in "iu" or not ((values >= 0) & (values < len(checkpoint.template))).all():
+            raise ValueError(f"{name} must name vertices, of which there are {len(checkpoint.template)}")
+    if missing := [name for name in NEEDED_REGIONS if not len(checkpoint.regions.get(name, ()))]:
+        raise ValueError(f"region {missing[0]} is missing")
+    numbers = [checkpoint.basis, checkpoint.template, *asdict(checkpoint.standardization).values()]
+    if not all(np.isfinite(values).all() for values in (*numbers, checkpoint.guidance, checkpoint.fps)):
+        raise ValueError("values that are not finite")
+    if not all(torch.isfinite(values).all() for values in checkpoint.ema.values()):
+        raise ValueError("weights that are not finite")
+    if checkpoint.fps <= 0:
+        raise ValueError(f"fps {checkpoint.fps}")
 
 
 def serialize(tensors: State, metadata: dict[str, str]) -> bytes:

@@ -47,7 +47,8 @@ def edit(
     Raises ModelError where motion, features and checkpoint do not fit each other, or like `synthesize`.
     """
     motion = kept.motion
-    _check(checkpoint, kept)
+    check_motion(checkpoint, motion)
+    _check(kept)
     if features is None:
         features = np.zeros((len(motion.valid), checkpoint.config.audio_width), np.float32)
         sampling["guidance"] = 0.0
@@ -72,9 +73,8 @@ def edit(
     ]
 
 
-def _check(checkpoint: Checkpoint, kept: Kept) -> None:
-    """ModelError where the motion is of another mesh or rate, or a frame to keep was not seen."""
-    motion = kept.motion
+def check_motion(checkpoint: Checkpoint, motion: Motion) -> None:
+    """ModelError where the motion is of another mesh or rate."""
     if motion.topology != checkpoint.topology:
         raise ModelError(
             f"the motion is of the mesh topology {motion.topology[:12]}, the checkpoint of"
@@ -84,6 +84,11 @@ def _check(checkpoint: Checkpoint, kept: Kept) -> None:
         raise ModelError(
             f"the motion has {motion.fps:g} frames a second, the checkpoint makes {checkpoint.fps:g}"
         )
+
+
+def _check(kept: Kept) -> None:
+    """ModelError where a frame to keep was not seen, or a vertex has no share."""
+    motion = kept.motion
     if kept.frames.shape != motion.valid.shape or (kept.frames & ~motion.valid).any():
         raise ModelError("frames to keep must be frames of the motion in which the face was seen")
     if kept.share is not None and kept.share.shape != (len(motion.template),):

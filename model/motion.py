@@ -75,7 +75,7 @@ class Motion:
     def sound_offset_s(self, sha256: str) -> float:
         """How late the sound of a file is against the motion, s; 0 of one of which nothing is known."""
         known = sha256 in self.provenance.get("av_offset_of", [])
-        return float(self.provenance["av_offset_s"]) if known else 0.0
+        return float(self.provenance.get("av_offset_s", 0.0)) if known else 0.0
 
     def displacements(self, vertices: NDArray[np.integer] | None = None) -> NDArray[np.float32]:
         """[N, D, 3] m, or [N, len(vertices), 3] for some vertices only."""
@@ -108,7 +108,9 @@ class Motion:
         arrays = _read_arrays(path)
         try:
             if "basis" not in arrays and "displacements" in arrays:
-                arrays["basis"], arrays["coefficients"] = principal_modes(arrays["displacements"])
+                moved, unseen = arrays["displacements"], ~arrays["valid"].astype(np.bool_)
+                moved[unseen] = np.nan_to_num(moved[unseen], nan=0.0, posinf=0.0, neginf=0.0)
+                arrays["basis"], arrays["coefficients"] = principal_modes(moved)
             motion = cls(
                 fps=float(arrays["fps"]),
                 start_s=float(arrays["start_s"]),
@@ -119,7 +121,7 @@ class Motion:
                 valid=arrays["valid"].astype(np.bool_),
                 provenance=json.loads(str(arrays["provenance"])) if "provenance" in arrays else {},
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, RecursionError) as error:
             raise MotionError(f"{path} is no motion file: {' '.join(str(error).split())}") from error
         _check_shapes(motion, path)
         _check_values(motion, path)
@@ -132,6 +134,8 @@ def principal_modes(displacements: NDArray[np.float32]) -> tuple[NDArray[np.floa
     """[N, D, 3] m -> orthonormal basis [K, D, 3] and coefficients [N, K] m, exact to BASIS_ERROR_M (rms)."""
     if displacements.ndim != 3 or displacements.shape[2] != 3 or 0 in displacements.shape:
         raise ValueError(f"displacements of shape {displacements.shape}, not [N, D, 3]")
+    if not np.isfinite(displacements).all():
+        raise ValueError("displacements that are not finite")
     frames, vertices, _ = displacements.shape
     flat = displacements.reshape(frames, -1)
     left, values, right = np.linalg.svd(flat.astype(np.float64), full_matrices=False)

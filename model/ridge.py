@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
 
@@ -45,10 +46,11 @@ class Ridge:
         x_val, y_val = _rows(val, "validation")
         mean, scale, offset = x.mean(axis=0), x.std(axis=0) + 1e-6, y.mean(axis=0)
         x, x_val = (x - mean) / scale, (x_val - mean) / scale
-        solutions = [_solve(x, y - offset, penalty * len(x)) for penalty in lambdas]
-        errors = [float(((x_val @ weights + offset - y_val) ** 2).sum()) for weights in solutions]
-        best = int(np.argmin(errors))
-        return cls(mean, scale, solutions[best], offset, lambdas[best])
+        errors, best = [], np.zeros(0)
+        for weights in _solutions(x, y - offset, [penalty * len(x) for penalty in lambdas]):
+            errors.append(float(((x_val @ weights + offset - y_val) ** 2).sum()))
+            best = weights if errors[-1] == min(errors) else best
+        return cls(mean, scale, best, offset, lambdas[int(np.argmin(errors))])
 
     def predict(self, features: F32) -> F32:
         """Speech features [N, W] at the motion's frames -> coefficients [N, K] m."""
@@ -56,13 +58,16 @@ class Ridge:
         return (standardized @ self.weights + self.offset).astype(np.float32)
 
 
-def _solve(x: F64, y: F64, penalty: float) -> F64:
-    """(x'x + penalty I)^-1 x'y, by whichever of the two equal forms has the smaller system."""
+def _solutions(x: F64, y: F64, penalties: Many[float]) -> Iterator[F64]:
+    """(x'x + penalty I)^-1 x'y of each penalty, by whichever of the two equal forms has the smaller system."""
     rows, columns = x.shape
-    if rows < columns:
-        return x.T @ solve(x @ x.T + penalty * np.eye(rows), y, assume_a="pos")
-    solution: F64 = solve(x.T @ x + penalty * np.eye(columns), x.T @ y, assume_a="pos")
-    return solution
+    few = rows < columns
+    gram, right = (x @ x.T, y) if few else (x.T @ x, x.T @ y)
+    for penalty in penalties:
+        system = gram.copy()
+        system[np.diag_indices_from(system)] += penalty
+        solution: F64 = solve(system, right, assume_a="pos", overwrite_a=True)
+        yield x.T @ solution if few else solution
 
 
 def _rows(sequences: Many[Sequence], what: str) -> tuple[F64, F64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import time
@@ -9,9 +10,11 @@ from collections.abc import Iterator
 from collections.abc import Sequence as Many
 from contextlib import contextmanager
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, distributed
 from torch.nn.parallel import DistributedDataParallel
@@ -90,6 +93,7 @@ class Trainer:
         self._start = [parameter.detach().clone() for parameter in own]
         self.step = 0
         self._losses: list[Tensor] = []
+        self._begun_with = _digest(checkpoint, opened)
         if (self.folder / STATE_FILE).exists():
             self._restore()
 
@@ -132,7 +136,8 @@ class Trainer:
         """One step of Adam on one random batch; its loss.
 
         All randomness comes from (seed, step), so a continued run draws what the uninterrupted one does. Of several
-        processes each draws all of it and takes its share: their mean gradient is the whole batch's.
+        processes each draws all of it and takes its share: where their number divides the batch, their mean gradient
+        is the whole batch's.
         """
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
         batch = self._crops.draw(self.config.batch, generator)
@@ -191,7 +196,7 @@ class Trainer:
         settings = asdict(self.config)
         for name in ("threads", "save_seconds", "log_every"):
             del settings[name]
-        settings |= {"crops": len(self._crops), "architecture": self._checkpoint.config.architecture}
+        settings |= {"architecture": self._checkpoint.config.architecture, "begun_with": self._begun_with}
         return json.dumps(settings, sort_keys=True)
 
     def _save(self) -> None:
@@ -210,7 +215,8 @@ class Trainer:
         tensors, metadata = read_tensors(path)
         if metadata.get("settings") != self._settings():
             raise ModelError(
-                f"{path} belongs to a training with other settings or data; remove its folder to start anew"
+                f"{path} belongs to a training with other settings, data or start, or on another kind of processor;"
+                " remove its folder to start anew"
             )
         self._network.load_state_dict({n: tensors[f"network.{n}"] for n in self._network.state_dict()})
         self._average = {n: tensors[f"average.{n}"].to(self._device) for n in self._average}
@@ -220,6 +226,16 @@ class Trainer:
             self._optimizer.state[parameter] = state
         self._losses = list(tensors["losses"].to(self._device))
         self.step = int(metadata["step"])
+
+
+def _digest(checkpoint: Checkpoint, sequences: Many[Sequence]) -> str:
+    """sha256 of the weights at the start and of all that is learned from."""
+    digest = hashlib.sha256()
+    weights = (value.numpy() for value in checkpoint.network.values())
+    learned = ((s.coefficients, s.features, s.valid, np.asarray(s.style)) for s in sequences)
+    for values in chain(weights, asdict(checkpoint.standardization).values(), *learned):
+        digest.update(np.ascontiguousarray(values).data)
+    return digest.hexdigest()
 
 
 def _averaged(objective: DistributedDataParallel) -> Gradient:

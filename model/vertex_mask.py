@@ -67,7 +67,7 @@ class VertexMask:
         kept = torch.from_numpy((mean @ self.free + self.kept[self.frames] - mean) / scale)
 
         def overwrite(x0: Tensor) -> Tensor:
-            batch = (len(rows),) + (1,) * (x0.ndim - 2) + (-1,)
+            batch = (len(rows),) + (1,) * (x0.ndim - 2) + (kept.shape[-1],)
             x0 = x0.clone()
             x0[rows] = x0[rows] @ free.to(x0) + kept.to(x0).view(batch)
             return x0

@@ -18,6 +18,7 @@ from model.speech_windows import SAMPLE_RATE, in_windows, peak_normalized
 
 N_FFT = 400  # 25 ms window
 HOP = 160  # 10 ms a mel frame
+TOGETHER = 6000  # mel frames transformed at once: the spectra of hours fill gigabytes
 N_MELS = 80
 STRIDE = 2  # mel frames a feature row: the second convolution halves the rate
 RATE = SAMPLE_RATE / (HOP * STRIDE)  # 50 feature rows a second; row k is centred at k / RATE
@@ -91,9 +92,14 @@ def embedded_encoder() -> WhisperEncoder:
 def log_mel(sound: Tensor) -> Tensor:
     """Whisper's log-mel spectrogram of sound [S >= 201] at 16 kHz -> [80, S // 160], centred at j / 100 s."""
     window = torch.hann_window(N_FFT)
-    spectrum = torch.stft(sound, N_FFT, HOP, window=window, return_complex=True)[:, :-1]
-    energy = mel_filters() @ spectrum.abs().square()
-    level = energy.clamp(min=1e-10).log10()
+    padded = F.pad(sound[None], (N_FFT // 2, N_FFT // 2), mode="reflect")[0]
+    parts = []
+    for start in range(0, len(sound) // HOP, TOGETHER):
+        stop = min(start + TOGETHER, len(sound) // HOP)
+        part = padded[start * HOP : (stop - 1) * HOP + N_FFT]
+        spectrum = torch.stft(part, N_FFT, HOP, window=window, center=False, return_complex=True)
+        parts.append(mel_filters() @ spectrum.abs().square())
+    level = torch.cat(parts, dim=1).clamp(min=1e-10).log10()
     return (torch.maximum(level, level.max() - 8.0) + 4.0) / 4.0
 
 

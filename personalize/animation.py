@@ -26,6 +26,7 @@ from personalize.video_writer import VideoWriter
 F32 = NDArray[np.float32]
 
 FILM_SIZE = (720, 720)
+SHORTEST_S = 0.1  # of sound: no syllable is shorter
 MOTION_NAME, FILM_NAME = "motion.npz", "animation.mp4"
 
 
@@ -103,6 +104,10 @@ def read_speech(speech: Path) -> tuple[F32, float]:
     sound, start_s = read_audio(speech, FILM_RATE)
     if not np.any(np.abs(sound) > 1e-4):
         raise UserError(f"{speech}: there is no sound in it; give a recording of speech")
+    if len(sound) < SHORTEST_S * FILM_RATE:
+        raise UserError(
+            f"{speech}: only {1e3 * len(sound) / FILM_RATE:.0f} ms of sound; give a recording of speech"
+        )
     return sound, start_s
 
 

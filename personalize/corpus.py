@@ -73,7 +73,7 @@ def there(data: Vocaset, names: tuple[str, ...]) -> list[str]:
 
 
 def check_parts(data: Vocaset, report: Reporter) -> None:
-    """UserError where the data has nobody to train or to validate on; a warning for each subject that is missing."""
+    """UserError where the data has nobody to train or to validate on; a warning for those that are missing."""
     for part, names in (("training", TRAIN), ("validation", VAL)):
         found = there(data, names)
         if not found:
@@ -81,6 +81,8 @@ def check_parts(data: Vocaset, report: Reporter) -> None:
         if len(found) < len(names):
             missing = [name for name in names if name not in found]
             report.warn(f"{data.folder} lacks the {part} subjects {', '.join(missing)}")
+    if not there(data, TEST):
+        report.warn(f"{data.folder} has none of the test subjects {', '.join(TEST)}: the tables stay empty")
 
 
 def tested(data: Vocaset, adapt: list[str]) -> list[str]:

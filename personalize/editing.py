@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from model.checkpoint import Checkpoint
 from model.diffusion import Rule
-from model.editing import Kept, edit, seam_of, with_frames
+from model.editing import Kept, check_motion, edit, seam_of, with_frames
 from model.errors import ModelError
 from model.motion import Motion, MotionError
 from model.speech import SpeechEncoder
@@ -71,9 +71,10 @@ def edit_motion(
     )
     checkpoint_path, checkpoint, encoder = load_subject(subject, settings.encoder)
     motion = _load_motion(path)
-    sound, features = (None, None) if speech is None else _sound_of(speech, motion, encoder, report)
-    guidance = _guidance(settings, checkpoint, heard=features is not None)
     try:
+        check_motion(checkpoint, motion)
+        sound, features = (None, None) if speech is None else _sound_of(speech, motion, encoder, report)
+        guidance = _guidance(settings, checkpoint, heard=features is not None)
         kept = _kept(motion, checkpoint, settings)
         with report.stage("synthesis"):
             edited = edit(

@@ -128,11 +128,13 @@ def compare_systems(
 ) -> list[dict[str, Any]]:
     """The rows of SYSTEMS, means over the subjects: {"table", "system", "seconds", "paper", and each of METRICS}.
 
-    base was trained on `train`; without adaptation a subject gets the mean of its styles. Adaptation takes 30 000
-    iterations, or the base's own where these are less. seconds: what a subject really gave for it. A metric is the mean
-    over 10 samples of each test sentence, weighted by frames; null where the adaptation diverged. Noise is on the
-    audio of the test. Everything finished stays in `work`, and is not done again.
+    None without a subject. base was trained on `train`; without adaptation a subject gets the mean of its styles.
+    Adaptation takes 30 000 iterations, or the base's own where these are less. seconds: what a subject really gave for
+    it. A metric is the mean over 10 samples of each test sentence, weighted by frames; null where the adaptation
+    diverged. Noise is on the audio of the test. Everything finished stays in `work`, and is not done again.
     """
+    if not subjects:
+        return []
     config = replace(config, iterations=min(ADAPTATION_ITERATIONS, config.iterations))
     tables = []
     for subject in subjects:

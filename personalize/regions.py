@@ -19,9 +19,12 @@ def kept_share(
     """Names of regions to keep, or of those to make anew -> share [D] f32, 1 kept .. 0 made anew; None without names.
 
     What is named is kept or made anew wholly; from its border outwards the share changes linearly over `blend_m` along
-    the surface. Raises UserError for an unknown name, and where both kinds are named.
+    the surface. Raises UserError for an unknown name, and where both kinds are named, or no
+    width.
     """
     keep, remake = tuple(keep), tuple(remake)
+    if not np.isfinite(blend_m):
+        raise UserError(f"--blend-mm {1e3 * blend_m:g}: give a width in mm")
     if keep and remake:
         raise UserError("--keep-regions and --remake: give one of them; what it does not name is the other")
     if not keep and not remake:

@@ -69,7 +69,7 @@ def _placed(runs: list[tuple[float, F32]], rate: int) -> tuple[F32, float]:
 
 def _loudness(samples: F32) -> float:
     """Root mean square of [.., S]; 0 of none."""
-    return float(np.sqrt(np.square(samples).mean())) if samples.size else 0.0
+    return float(np.linalg.norm(samples.ravel())) / samples.size**0.5 if samples.size else 0.0
 
 
 def _one_channel(channels: F32) -> F32:
@@ -109,12 +109,13 @@ class _Run:
 
     def close(self) -> tuple[float, F32]:
         """(start on the container's clock s, samples)."""
+        self._parts += [out.to_ndarray() for out in self._resampler.resample(None)]
         if not self._parts:
             return self._start, np.zeros(0, np.float32)
-        self._parts += [out.to_ndarray() for out in self._resampler.resample(None)]
         # Sound stored as numbers with a point may hold ones that are none.
-        channels = np.nan_to_num(np.concatenate(self._parts, axis=1), nan=0.0, posinf=0.0, neginf=0.0)
-        return self._start, _one_channel(channels)
+        channels = np.concatenate(self._parts, axis=1)
+        self._parts = []  # hours of sound fill gigabytes
+        return self._start, _one_channel(np.nan_to_num(channels, copy=False, nan=0.0, posinf=0.0, neginf=0.0))
 
 
 def _kind(frame: Any) -> tuple[str, str, int]:

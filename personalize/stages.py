@@ -267,11 +267,12 @@ class Finetune(Stage):
 class Evaluate(Stage):
     """Metrics on the test split, one clip beside its reference, the report."""
 
-    name, folder, version, reads = "evaluate", "evaluation", 3, ("seed", "overlay", "tracked")
+    name, folder, version, reads = "evaluate", "evaluation", 4, ("seed", "overlay", "tracked")
     needs = (
         *(VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv"),
         *("overlay/preview.mp4", "overlay/contact_sheet.png", *JUDGED),
-        *("ingest/media.json", "photometric/deviation.npz"),
+        *("ingest/media.json", "landmarks/landmarks.npz"),
+        *("photometric/track.npz", "photometric/deviation.npz"),
     )
     makes, products = ("metrics.json", "samples/test.mp4", "samples/test.npz"), ("report.html",)
 

@@ -52,6 +52,7 @@ def _frame(text: str, motion: Motion, option: str, lowest: int, highest: int) ->
     if not lowest <= frame <= highest:
         end_s = motion.start_s + length_s
         raise UserError(
-            f"{option}: {text} is outside the motion, which is from {motion.start_s:.2f} to {end_s:.2f} s"
+            f"{option}: {text} is outside the motion, which is from {motion.start_s:.2f} to {end_s:.2f} s, its last"
+            f" frame at {end_s - 1 / motion.fps:.2f} s"
         )
     return frame

@@ -36,7 +36,8 @@ def write_clip(
     """time [n] s, reference and sample [n, K] m -> an mp4 of three pictures side by side at the motion's rate."""
     camera = FaceCamera(motion.template, motion.faces, checkpoint.regions["face"], PANEL)
     sound, start_s = read_audio(run.video, FILM_RATE)
-    audio = on_video_clock(sound, start_s - float(time[0]), len(time) / motion.fps, FILM_RATE)
+    late_s = motion.sound_offset_s(run.video_sha256)
+    audio = on_video_clock(sound, start_s - float(time[0]) - late_s, len(time) / motion.fps, FILM_RATE)
     width, height = PANEL
     with VideoWriter(path, motion.fps, (3 * width, height), audio, FILM_RATE, CRF) as film:
         for index, picture in enumerate(_face_pictures(run, time)):

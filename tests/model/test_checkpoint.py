@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -129,10 +130,32 @@ def test_a_file_from_before_there_was_a_spread(path: Path) -> None:
         {"standardization.scale": torch.zeros(talker.K)},
         {"standardization.spread": torch.ones(2)},
         {"ema.decoder.bias": torch.zeros(2)},
+        {"network.decoder.bias": torch.zeros(2)},
+        {"ema.decoder.bias": torch.full((talker.K,), torch.nan)},
+        {"metadata": {"schedule": "steep"}},
+        {"metadata": {"parametrization": "v"}},
+        {"metadata": {"guidance": "nan"}},
+        {"metadata": {"fps": "0"}},
+        {"basis": torch.full((talker.K, talker.D, 3), torch.nan)},
+        {"standardization.mean": torch.full((talker.K,), torch.inf)},
+        {"standardization.audio_mean": torch.zeros(3)},
+        {"standardization.audio_scale": torch.zeros(talker.W)},
+        {"faces": torch.full((talker.D - 2, 3), talker.D, dtype=torch.int32)},
+        {"faces": torch.zeros(talker.D - 2, 3)},
+        {"regions.face": torch.tensor([-1], dtype=torch.int32)},
+        {"regions.lips": torch.zeros(0, dtype=torch.int32)},
+        {"drop": "regions.inner_lip_upper"},
     ],
 )
 def test_parts_that_do_not_fit(path: Path, changes: dict) -> None:
     rewritten(path, **changes)
+    with pytest.raises(ModelError, match="damaged or incomplete"):
+        Checkpoint.load(path)
+
+
+def test_sizes_that_no_memory_holds_are_refused_before_it_is_taken(path: Path) -> None:
+    sizes = json.loads(read_tensors(path)[1]["network"]) | {"channels": 1 << 20}
+    rewritten(path, metadata={"network": json.dumps(sizes)})
     with pytest.raises(ModelError, match="damaged or incomplete"):
         Checkpoint.load(path)
 

@@ -193,6 +193,18 @@ def test_seam_of_an_untouched_and_of_a_torn_motion(toy: Checkpoint) -> None:
     assert seam_of(replace(motion, coefficients=coefficients), frames, motion, face) > 3
 
 
+def test_with_nothing_to_keep_parts_of_the_face_are_no_matter(toy: Checkpoint) -> None:
+    share = np.zeros(talker.D, np.float32)
+    share[:7] = 1
+    motion = motion_of(toy)
+    whole = edit(toy, features(), Kept(motion, np.ones(N, bool), share), steps=FAST)[0]
+    np.testing.assert_allclose(whole.displacements(), motion.displacements(), atol=1e-6)
+    unseen = replace(motion, valid=spans())
+    free = edit(toy, features(), Kept(unseen, spans(), share), steps=FAST)[0]
+    anew = edit(toy, features(), Kept(unseen, spans()), steps=FAST)[0]
+    np.testing.assert_allclose(free.displacements(), anew.displacements(), atol=1e-6)
+
+
 def test_refusals(toy: Checkpoint) -> None:
     motion = motion_of(toy)
     other_mesh = replace(motion, faces=motion.faces[1:])

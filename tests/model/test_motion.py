@@ -97,6 +97,7 @@ def test_missing_arrays(path: Path, missing: str) -> None:
         ({"coefficients": np.full((40, talker.K), np.nan)}, "not finite"),
         ({"fps": "fast"}, "no motion file"),
         ({"provenance": "{"}, "no motion file"),
+        ({"provenance": "[" * 100_000}, "no motion file"),
         ({"provenance": "[]"}, "provenance is no JSON object"),
         ({"provenance": "3"}, "provenance is no JSON object"),
         ({"provenance": '{"av_offset_s": "late"}'}, "av_offset_s 'late' in the provenance"),
@@ -120,6 +121,23 @@ def test_invalid_frames_may_hold_anything(motion: Motion, path: Path) -> None:
     coefficients[3] = np.nan
     replace(motion, coefficients=coefficients).save(path)
     assert np.isnan(Motion.load(path).coefficients[3]).all()
+
+
+def test_displacements_of_invalid_frames_may_hold_anything(motion: Motion, path: Path) -> None:
+    displacements, valid = motion.displacements(), motion.valid.copy()
+    frame = np.flatnonzero(valid)[0]
+    displacements[frame], valid[frame] = np.nan, False
+    rewritten(path, drop="basis", displacements=displacements, valid=valid)
+    rewritten(path, drop="coefficients")
+    found = Motion.load(path).displacements()
+    np.testing.assert_allclose(found[valid], motion.displacements()[valid], atol=1e-4)
+    rewritten(path, valid=motion.valid)
+    with pytest.raises(MotionError, match="displacements that are not finite"):
+        Motion.load(path)
+
+
+def test_a_sound_of_whose_delay_nothing_is_told_is_not_late(motion: Motion) -> None:
+    assert replace(motion, provenance={"av_offset_of": ["a"]}).sound_offset_s("a") == 0.0
 
 
 def test_missing_truncated_and_foreign_files(path: Path) -> None:

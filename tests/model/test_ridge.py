@@ -7,7 +7,7 @@ import pytest
 
 from model.dataset import Sequence
 from model.errors import ModelError
-from model.ridge import LAMBDAS, Ridge, _solve
+from model.ridge import LAMBDAS, Ridge, _solutions
 
 
 def linear(frames: int, seed: int, noise: float = 0.0) -> Sequence:
@@ -33,7 +33,10 @@ def test_fewer_rows_than_columns_and_more_solve_the_same_equations() -> None:
     """At the border, 45 columns: 44 rows go one way, the same rows and two zero ones the other."""
     x, y = np.random.default_rng(0).standard_normal((2, 44, 45))
     padded = [np.concatenate([rows, np.zeros((2, 45))]) for rows in (x, y)]
-    np.testing.assert_allclose(_solve(x, y, 3.0), _solve(*padded, 3.0), atol=1e-9)
+    both = zip(_solutions(x, y, [3.0, 0.5]), _solutions(*padded, [3.0, 0.5]), strict=True)
+    for penalty, (one, other) in zip((3.0, 0.5), both, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+        np.testing.assert_allclose(x.T @ x @ one + penalty * one, x.T @ y, atol=1e-9)
 
 
 def test_noise_asks_for_a_larger_lambda_than_none() -> None:

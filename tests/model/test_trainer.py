@@ -103,11 +103,16 @@ def test_it_starts_from_a_checkpoint_file_as_from_memory(tmp_path: Path) -> None
 def test_a_state_of_another_training_is_refused(tmp_path: Path) -> None:
     checkpoint, sequences = start()
     Trainer(checkpoint, sequences, tmp_path, TINY).train()
-    with pytest.raises(ModelError, match="other settings or data"):
+    with pytest.raises(ModelError, match="other settings, data or start"):
         Trainer(checkpoint, sequences, tmp_path, replace(TINY, learning_rate=3e-4))
-    with pytest.raises(ModelError, match="other settings or data"):
+    with pytest.raises(ModelError, match="other settings, data or start"):
         Trainer(checkpoint, sequences[:1], tmp_path, TINY)
-    with pytest.raises(ModelError, match="other settings or data"):
+    moved = [replace(one, coefficients=one.coefficients * np.float32(1.01)) for one in sequences]
+    with pytest.raises(ModelError, match="other settings, data or start"):
+        Trainer(checkpoint, moved, tmp_path, TINY)
+    with pytest.raises(ModelError, match="other settings, data or start"):
+        Trainer(talker.shaken(checkpoint), sequences, tmp_path, TINY)
+    with pytest.raises(ModelError, match="other settings, data or start"):
         Trainer(talker.checkpoint(sequences, architecture="transformer"), sequences, tmp_path, TINY)
     Trainer(checkpoint, sequences, tmp_path, replace(TINY, threads=2, log_every=7))  # changes no result
     (tmp_path / STATE_FILE).write_bytes(b"half")

@@ -44,6 +44,15 @@ def test_a_row_is_centred_at_its_time() -> None:
     assert loud.mean() == 100.0
 
 
+def test_the_spectrum_of_a_long_sound_is_made_in_parts_that_leave_no_seam(
+    voice: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sound = torch.from_numpy(voice[: 3 * SAMPLE_RATE + 77])
+    whole = whisper_encoder.log_mel(sound)
+    monkeypatch.setattr(whisper_encoder, "TOGETHER", 7)
+    torch.testing.assert_close(whisper_encoder.log_mel(sound), whole, atol=1e-5, rtol=0)
+
+
 def test_windows_leave_no_seam(voice: np.ndarray) -> None:
     """Where windows begin and end, features move no more than elsewhere."""
     features, _ = embedded_encoder().encode(voice)

@@ -18,7 +18,7 @@ from personalize.errors import UserError
 from personalize.files import sha256_file
 from personalize.pictures import FrameReader
 from personalize.reporter import Reporter
-from personalize.sound import read_audio, write_wav
+from personalize.sound import FILM_RATE, read_audio, write_wav
 from personalize.subject_data import BASE_CHECKPOINT, speech_features
 from personalize.talkers.film import ASSETS
 
@@ -142,7 +142,8 @@ def test_the_sound_of_a_run_lies_where_registration_put_it(
 def test_mistakes_get_one_line_and_write_nothing(
     base: Checkpoint, motion: Path, speech: Path, tmp_path: Path
 ) -> None:
-    short, silent = tmp_path / "short.wav", tmp_path / "silent.wav"
+    short, silent, click = (tmp_path / f"{name}.wav" for name in ("short", "silent", "click"))
+    write_wav(click, np.ones(100, np.float32), FILM_RATE)
     write_wav(short, read_audio(speech)[0][:16000])
     write_wav(silent, np.zeros(48000, np.float32))
     read = Motion.load(motion)
@@ -153,6 +154,7 @@ def test_mistakes_get_one_line_and_write_nothing(
         "gap": dataclasses.replace(read, valid=gap),
         "slow": dataclasses.replace(read, fps=25.0),
         "early": dataclasses.replace(read, start_s=0.0),
+        "endless": dataclasses.replace(read, fps=1e-6, start_s=-1e8),
     }.items():
         changed.save(tmp_path / f"{name}.npz")
     before = sorted(tmp_path.iterdir())
@@ -168,8 +170,11 @@ def test_mistakes_get_one_line_and_write_nothing(
     refused("one of them", keep_regions=("lips",), remake=("eyes",))
     refused(r"short.wav: its sound ends at 1.00 s, the motion at 1.97 s", audio=short)
     refused("silent.wav: there is no sound", audio=silent)
+    refused("click.wav: only 2 ms of sound", audio=click)
     refused("mesh topology", path=tmp_path / "mesh.npz")
     refused("25 frames a second", path=tmp_path / "slow.npz")
+    refused("1e-06 frames a second", path=tmp_path / "endless.npz")
+    refused("--blend-mm inf", keep_regions=("lips",), blend_mm=np.inf)
     refused("same mesh", keyframes="0.9", source=tmp_path / "mesh.npz")
     refused("no face was seen at 0.90 s", path=tmp_path / "gap.npz", keyframes="0.9")
     refused("1.93 s is outside .*early.npz", keyframes="1.93", source=tmp_path / "early.npz")

@@ -321,6 +321,14 @@ def test_wav_keeps_its_samples(tmp_path: Path) -> None:
     assert start == 0 and np.abs(read - samples).max() < 1e-4
 
 
+@pytest.mark.parametrize("rate", [8_000, 44_100, 48_000])
+def test_a_moment_of_sound_is_not_lost(tmp_path: Path, rate: int) -> None:
+    """Shorter than what a resampler waits for."""
+    write_wav(tmp_path / "a.wav", np.full(rate // 250, 0.5, np.float32), rate)
+    read, _ = read_audio(tmp_path / "a.wav", 48_000)
+    assert len(read) == pytest.approx(192, abs=2) and read.max() > 0.3
+
+
 def test_damaged_pictures_are_named_until_the_next_key(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     pictures = [rng.integers(0, 255, (64, 96, 3), dtype=np.uint8) for _ in range(40)]

@@ -54,6 +54,11 @@ def test_what_lies_outside_is_refused(text: str) -> None:
         frames_at(text, motion(), "--keep")
 
 
+def test_a_time_in_the_last_half_frame_is_told_where_the_last_one_lies() -> None:
+    with pytest.raises(UserError, match=r"9.99 is outside .* its last frame at 9.97 s"):
+        frames_at("9.99", motion(), "--keep")
+
+
 @pytest.mark.parametrize("text", ["a", "1:b", "nan", "inf:", "1,,2", "1:2:3", "%"])
 def test_what_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(UserError, match="is no time"):
