@@ -6,8 +6,8 @@ Beside them the error of the bundle's head rotations, their constant difference 
 
 from __future__ import annotations
 
+import argparse
 import os
-import sys
 import time
 from pathlib import Path
 
@@ -50,6 +50,9 @@ def line(path: Path, camera: Camera, bundle: Bundle, seconds: float, truth: Grou
 
 def main() -> None:
     """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("videos", nargs="*", type=Path, metavar="VIDEO")
+    videos = parser.parse_args().videos
     head = load_head()
     shared = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[2] / "shared"))
     rendered = sorted((shared / "data" / "gt").glob("*.mp4"))
@@ -57,7 +60,7 @@ def main() -> None:
         f"{'clip':>28} {'method':>7} {'f / long':>8} {'sd log':>7} {'frames':>7} {'points':>7} {'took s':>7} "
         f"{'truth':>8} {'error':>7} {'rot. deg':>9}"
     )
-    for path in [*rendered, *map(Path, sys.argv[1:])]:
+    for path in [*rendered, *videos]:
         truth = GroundTruth.load(path.with_suffix(".npz")) if path in rendered else None
         print(line(path, *measure(path, head), truth), flush=True)
 

@@ -1,7 +1,7 @@
-"""Editing on a run's test split, METHOD 8's rows: `python -m benchmarks editing talk.personalize [--samples 10]`.
+"""Editing on a run's test split (docs/figures.md): `python -m benchmarks editing talk.personalize [--samples 10]`.
 
 Free synthesis, in-betweening (p % of the frames kept, half of them at each end), and evenly spaced keyframes. The
-columns are METHOD 7's metrics over all frames, kept ones included, mean over the samples and the spans of the split by
+columns are the metrics over all frames, kept ones included, mean over the samples and the spans of the split by
 their frames; `kept` is the share of frames kept, `seam` the jerk at the borders. At the end: does every further kept
 frame help?
 """
@@ -43,7 +43,7 @@ def keyframes(frames: int, per_second: int) -> NDArray[np.bool_]:
 def score_span(
     checkpoint: Checkpoint, span: Span, kept: NDArray[np.bool_], samples: int, rule: Rule, seed: int
 ) -> dict[str, float]:
-    """METHOD's metrics of edits of one span that keep these frames [N]."""
+    """The metrics of edits of one span that keep these frames [N]."""
     sequence = span.sequence
     keep = Keep(sequence.coefficients, kept & sequence.valid)
     drawn = synthesize(checkpoint, sequence.features, samples=samples, seed=seed, rule=rule, keep=keep)

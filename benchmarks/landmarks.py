@@ -6,7 +6,7 @@ frame, which is searched, left out, and the worst frame.
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 from pathlib import Path
 
@@ -37,8 +37,11 @@ def measure(video: Path, threads: int) -> tuple[float, float, float, int]:
 
 def main() -> None:
     """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("videos", nargs="*", type=Path, metavar="VIDEO")
+    videos = parser.parse_args().videos
     print(f"{'video':40} {'threads':>7} {'decode ms':>9} {'landmarks ms':>12} {'worst ms':>8} {'faces':>5}")
-    for video in map(Path, sys.argv[1:]):
+    for video in videos:
         for threads in (1, 2):
             decode, landmarks, worst, faces = measure(video, threads)
             print(f"{video.name:40} {threads:7} {decode:9.1f} {landmarks:12.1f} {worst:8.1f} {faces:5}")

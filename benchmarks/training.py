@@ -19,7 +19,7 @@ from model.dataset import Sequence, Standardization
 from model.trainer import Trainer
 from model.training_config import TrainingConfig
 
-MODES, WIDTH, VERTICES, FRAMES = 56, 384, 4843, 1800
+MODES, WIDTH, VERTICES, FRAMES = 56, 384, 4754, 1800
 ITERATIONS = TrainingConfig.iterations
 
 

@@ -42,7 +42,9 @@ def edit(
     unconditional: Annotated[
         bool, typer.Option("--unconditional", help="Do not listen to the audio, only play it.")
     ] = False,
-    out: Annotated[Path | None, typer.Option(help="Output folder; motion.edit if not given.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder; MOTION's name + .edit if not given.")
+    ] = None,
     samples: Annotated[int, typer.Option(min=1, max=100, help="How many different edits.")] = 1,
     guidance: Annotated[
         float | None, typer.Option(min=0, max=2, help="Guidance scale; the checkpoint's own if not given.")

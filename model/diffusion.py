@@ -156,9 +156,9 @@ class Diffusion:
     ) -> Tensor:
         """Run the whole reverse chain from unit noise of `shape` [N, *b, K].
 
-        overwrite: applied to every x0hat that a step goes on from, e.g. to put known values back into the frames
-        to keep (METHOD 5). The last x0hat is the result as predicted: the caller puts known values back exactly.
-        Raises ModelError for an unknown rule or an impossible number of steps.
+        overwrite: applied to every x0hat that a step goes on from, e.g. to put known values back into the frames to
+        keep (docs/method.md, Editing). The last x0hat is the result as predicted: the caller puts known values back
+        exactly. Raises ModelError for an unknown rule or an impossible number of steps.
         """
         if rule not in RULES:
             raise ModelError(f"sampling rule {rule!r} is not known; use one of {', '.join(RULES)}")

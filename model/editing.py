@@ -1,4 +1,4 @@
-"""Edits of a motion (METHOD 5): what is kept of it, and the motion that goes through what is kept."""
+"""Edits of a motion: what is kept of it, and the motion that goes through what is kept."""
 
 from __future__ import annotations
 
@@ -113,7 +113,8 @@ def with_frames(motion: Motion, other: Motion, frames: Bool, source: NDArray[np.
 
 
 def seam_of(edited: Motion, frames: Bool, reference: Motion, face: NDArray[np.integer]) -> float:
-    """METHOD's `seam` over the face's vertices: the edited motion, its kept frames [N], and the person's own motion."""
+    """`seam` (model/metrics.py) over the face's vertices: the edited motion, its kept frames [N], and the person's own
+    motion."""
     valid = reference.valid
     shot = np.cumsum(np.diff(valid.astype(int), prepend=0) == 1)[valid]
     own = reference.coefficients[valid] @ isometry(reference.basis, face)

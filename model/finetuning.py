@@ -1,4 +1,4 @@
-"""Personalization: the base model becomes one person's; choice of checkpoint and guidance on validation (METHOD 4)."""
+"""Personalization: the base model becomes one person's; choice of checkpoint and guidance on validation."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def validation_metrics(
     seed: int,
     ddim_steps: int | None = None,
 ) -> dict[str, float]:
-    """METHOD's metrics of synthesized samples of one sequence."""
+    """The metrics of synthesized samples of one sequence."""
     drawn = synthesize(
         checkpoint,
         sequence.features,

@@ -1,4 +1,4 @@
-"""METHOD's metrics: how far synthesized motion is from a reference, how alive and how diverse it is.
+"""The metrics (docs/method.md): how far synthesized motion is from a reference, how alive and how diverse it is.
 
 Every metric is a pure function of vertices, or of the lip opening, in millimetres; `score` computes all of
 them for one span of a person, region by region.

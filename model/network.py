@@ -68,7 +68,7 @@ class Up(TimeConv):
 
 class Network(Denoiser):
     """The paper's: convolutions over time, each block followed by one that sees the speech beside the motion
-    (METHOD 2).
+    (docs/method.md).
     """
 
     halo = HALO

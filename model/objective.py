@@ -1,4 +1,4 @@
-"""METHOD's objective: the loss of one random batch, and its gradient."""
+"""The objective: the loss of one random batch, and its gradient."""
 
 from __future__ import annotations
 
@@ -36,9 +36,7 @@ def coefficient_weights(scale: Tensor, spread: Tensor, power: float) -> Tensor:
 
 
 def objective(x0: Tensor, predicted: Tensor, weights: Tensor, velocity: float) -> Tensor:
-    """METHOD 4: ||x0 - x0hat||^2 + velocity ||dx0 - dx0hat||^2, each a mean over its frames; [N, B, K] ->
-    scalar.
-    """
+    """||x0 - x0hat||^2 + velocity ||dx0 - dx0hat||^2, each a mean over its frames; [N, B, K] -> scalar."""
     residual = x0 - predicted
     change = residual[1:] - residual[:-1]
     frames, batch = x0.shape[0], x0.shape[1]

@@ -126,7 +126,7 @@ def synthesize(
 
     style: a name of the checkpoint's styles; None for the subject. guidance: s; None for the checkpoint's
     own.
-    keep: known values, put into every step's x0hat (METHOD 5) and returned exactly.
+    keep: known values, put into every step's x0hat and returned exactly.
     The same arguments give the same bytes. Raises ModelError for features of another width, an unknown
     style or rule.
     """

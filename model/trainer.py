@@ -1,4 +1,4 @@
-"""Training: METHOD's objective, averaged weights, candidates, exact continuation; on one process or several."""
+"""Training: the objective, averaged weights, candidates, exact continuation; on one process or several."""
 
 from __future__ import annotations
 

@@ -181,7 +181,7 @@ def import_transformers(source: str) -> Any:
     except ImportError as error:
         raise ModelError(
             f"{source}: a speech encoder other than the embedded one needs the package transformers: "
-            "pip install 'personalize[encoders]'"
+            "in the program's folder, .venv/bin/python -m pip install -c constraints.txt -e '.[encoders]'"
         ) from error
     transformers.logging.set_verbosity_error()
     transformers.logging.disable_progress_bar()

@@ -1,8 +1,8 @@
 """Parts of the face kept while others are made anew: the overwrite of single vertices, in K dimensions.
 
 In vertex space every denoising step overwrites x0hat <- m known + (1 - m) x0hat, vertex by vertex, m [D] in 0..1
-(METHOD 5). The network sees the chain through the basis B [K, 3D] alone, and the reverse rules are linear in x0hat,
-x_t and noise; so what it sees is exactly, with x0hat = c B,
+(docs/method.md). The network sees the chain through the basis B [K, 3D] alone, and the reverse rules are linear in
+x0hat, x_t and noise; so what it sees is exactly, with x0hat = c B,
 
     c <- c B diag(1 - m) B' + (m known) B'
 

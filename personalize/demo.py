@@ -33,7 +33,7 @@ ERROR_MEANINGS = {
 
 
 def run_demo(out: Path, iterations: int, seed: int) -> dict[str, float]:
-    """Render, personalize, compare; writes `demo.mp4`, its run folder and `errors.json` into `out`.
+    """Render, personalize, compare; writes `demo_SEED.mp4` and its truth, the run folder and `errors.json` into `out`.
 
     Returns the true errors by the names of ERROR_MEANINGS. The film is made once per folder and seed.
     """

@@ -73,7 +73,7 @@ class Reference:
     audio: F32
 
     def score(self, samples: F32, checkpoint: Checkpoint) -> dict[str, float]:
-        """METHOD's metrics of samples [S, N, K] m against the captured motion, off the model's basis as well."""
+        """The metrics of samples [S, N, K] m against the captured motion, off the model's basis as well."""
         rest = np.zeros((*samples.shape[:2], len(self.outside)), np.float32)
         whole = replace(checkpoint, basis=np.concatenate([checkpoint.basis, self.outside]))
         captured = np.concatenate([self.sequence.coefficients, self.outside_coefficients], axis=1)

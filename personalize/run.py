@@ -157,7 +157,7 @@ class RunFolder:
 
 
 def write_frames(path: Path, frames: Frames) -> None:
-    """`ingest/frames.npz`; `segment` and `box` stand beside DESIGN's keys."""
+    """`ingest/frames.npz`; its keys are those of `Frames`."""
     arrays = {name: np.asarray(value) for name, value in vars(frames).items()}
     write_npz(path, **arrays)
 

@@ -1,4 +1,4 @@
-"""Which frames of a clip are usable and why not, its uninterrupted shots, and the split in time."""
+"""Which frames of a clip are usable and why not, and its uninterrupted shots."""
 
 from __future__ import annotations
 

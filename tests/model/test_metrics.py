@@ -1,4 +1,4 @@
-"""METHOD's metrics, worked by hand on a few vertices."""
+"""The metrics, worked by hand on a few vertices."""
 
 from __future__ import annotations
 

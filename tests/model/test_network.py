@@ -102,7 +102,7 @@ def test_the_vertex_model_is_the_basis_form(parametrization: Parametrization) ->
     vertices_t = diffusion.add_noise(x0 @ basis, t, noise)
     skipped = vertices_t @ basis.T @ basis
     predicted = diffusion.x0(large(vertices_t, t, large.condition(audio, keep), style), skipped, t)
-    # In metres: each mode at its own size, then METHOD 4's formula as it stands, over the motion's variance.
+    # In metres: each mode at its own size, then the paper's formula as it stands, over the motion's variance.
     residual = ((x0 @ basis - predicted) @ basis.T * scale) @ basis
     change = residual[1:] - residual[:-1]
     vertex_loss = residual.square().sum(-1).mean() + 10.0 * change.square().sum(-1).mean()

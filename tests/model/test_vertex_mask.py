@@ -47,7 +47,7 @@ def vertex_chain(
     rule: Rule,
     seed: int,
 ) -> np.ndarray:
-    """The whole chain over displacements [N, S, 3D] m, METHOD 5 as it stands; share and known [N, 1, 3D].
+    """The whole chain over displacements [N, S, 3D] m, as the paper has it; share and known [N, 1, 3D].
 
     Its noise is the one of the K coefficients, and as much again outside their span.
     """
