@@ -68,8 +68,8 @@ def edit(
         keep=keep,
         keyframes=keyframes,
         source=source,
-        keep_regions=_names(keep_regions),
-        remake=_names(remake),
+        keep_regions=_names(keep_regions, "--keep-regions"),
+        remake=_names(remake, "--remake"),
         blend_mm=blend_mm,
         unconditional=unconditional,
         samples=samples,
@@ -82,5 +82,10 @@ def edit(
         typer.echo(path)
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+def _names(text: str, option: str) -> tuple[str, ...]:
+    from personalize.errors import UserError
+
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if text and not names:
+        raise UserError(f"{option} {text!r}: names no part of the face")
+    return names

@@ -116,8 +116,8 @@ def main() -> None:
             code = INPUT_ERROR
         elif isinstance(error, OSError) and error.errno in CLOSED and error.filename:
             typer.echo(
-                f"personalize: {error.filename}: cannot be read or written ({error.strerror}); choose another place "
-                "(--out)",
+                f"personalize: {error.filename}: cannot be read or written ({error.strerror}); mind its "
+                "permissions and its name, or choose another --out",
                 err=True,
             )
             code = INPUT_ERROR

@@ -59,6 +59,8 @@ def train(
         raise UserError(
             "VOCAset holds no faces: give a mesh of its topology with --template-mesh FLAME_sample.ply"
         )
+    if motions is not None and (template_mesh is not None or adapt):
+        raise UserError("--template-mesh and --adapt go with --vocaset; leave them out")
 
     from personalize.reporter import Reporter
     from personalize.training import TrainSettings, train_on_motions, train_on_vocaset

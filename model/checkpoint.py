@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -269,10 +270,21 @@ def serialize(tensors: State, metadata: dict[str, str]) -> bytes:
     return len(header).to_bytes(8, "little") + header + content[start:]
 
 
+def is_checkpoint(path: Path) -> bool:
+    """Whether a file is a checkpoint, of whatever schema."""
+    try:
+        with safe_open(path, framework="pt") as stream:
+            return "schema" in (stream.metadata() or {})
+    except (SafetensorError, OSError):
+        return False
+
+
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors and metadata of a safetensors file; ModelError, in one line, where it is not one."""
     if not path.is_file():
         raise ModelError(f"there is no file {path}")
+    if not os.access(path, os.R_OK):
+        raise ModelError(f"{path} may not be read; mind its permissions")
     try:
         with safe_open(path, framework="pt") as stream:
             return {name: stream.get_tensor(name) for name in stream.keys()}, stream.metadata() or {}  # noqa: SIM118

@@ -212,7 +212,10 @@ class Trainer:
 
     def _restore(self) -> None:
         path = self.folder / STATE_FILE
-        tensors, metadata = read_tensors(path)
+        try:
+            tensors, metadata = read_tensors(path)
+        except ModelError as error:
+            raise ModelError(f"{error}: remove its folder to train anew") from error
         if metadata.get("settings") != self._settings():
             raise ModelError(
                 f"{path} belongs to a training with other settings, data or start, or on another kind of processor;"

@@ -27,6 +27,7 @@ F32 = NDArray[np.float32]
 
 FILM_SIZE = (720, 720)
 SHORTEST_S = 0.1  # of sound: no syllable is shorter
+SOUND_SLACK_S = 0.1  # sound and pictures of one recording may end this far apart
 MOTION_NAME, FILM_NAME = "motion.npz", "animation.mp4"
 
 
@@ -99,14 +100,22 @@ def load_subject(subject: Path, encoder: str | None) -> tuple[Path, Checkpoint, 
         raise UserError(str(error)) from error
 
 
-def read_speech(speech: Path) -> tuple[F32, float]:
-    """Sound [S] at 48 kHz and the time s of its first sample; UserError where there is nothing to hear."""
+def read_speech(speech: Path, until_s: float = 0.0) -> tuple[F32, float]:
+    """Sound [S] at 48 kHz and the time s of its first sample.
+
+    Raises UserError where there is nothing to hear, or it ends before a motion that lasts `until_s`.
+    """
     sound, start_s = read_audio(speech, FILM_RATE)
     if not np.any(np.abs(sound) > 1e-4):
         raise UserError(f"{speech}: there is no sound in it; give a recording of speech")
     if len(sound) < SHORTEST_S * FILM_RATE:
         raise UserError(
             f"{speech}: only {1e3 * len(sound) / FILM_RATE:.0f} ms of sound; give a recording of speech"
+        )
+    end_s = start_s + len(sound) / FILM_RATE
+    if end_s < until_s - SOUND_SLACK_S:
+        raise UserError(
+            f"{speech}: its sound ends at {end_s:.2f} s, the motion at {until_s:.2f} s; give the whole recording"
         )
     return sound, start_s
 
@@ -144,6 +153,7 @@ def write_sample(
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{place}: cannot be written ({error.strerror}); choose another --out") from None
+    (place / FILM_NAME).unlink(missing_ok=True)  # of another motion, should this end before its own is drawn
     motion.save(place / MOTION_NAME)
     yield place / MOTION_NAME
     with report.stage("film"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ def run_demo(out: Path, iterations: int, seed: int) -> dict[str, float]:
         raise UserError(f"{out}: cannot be written ({error.strerror}); choose another with --out") from None
     video, truth_file = out / f"demo_{seed}.mp4", out / f"demo_{seed}.truth.npz"
     # The truth is written after the film: when it is there, both are whole.
-    if not truth_file.is_file():
+    if not (video.is_file() and _is_truth(truth_file)):
         report.say("rendering 40 s of a made-up person who says a sonnet")
         with report.stage("rendering"):
             render_demo(video, head, seed, report.progress)
@@ -58,6 +59,14 @@ def run_demo(out: Path, iterations: int, seed: int) -> dict[str, float]:
     errors = true_errors(read_track(result["run"] / "refine/track.npz"), Truth.load(truth_file), head)
     write_json(out / "errors.json", errors)
     return errors
+
+
+def _is_truth(path: Path) -> bool:
+    try:
+        Truth.load(path)
+    except (OSError, ValueError, KeyError, BadZipFile):
+        return False
+    return True
 
 
 def true_errors(track: Track, truth: Truth, head: HeadModel) -> dict[str, float]:

@@ -29,8 +29,6 @@ from personalize.times import frames_at
 F32 = NDArray[np.float32]
 
 OFFSET = ("av_offset_s", "av_offset_of")  # of the run's sound, whatever is heard in an edit
-# Sound and pictures of one recording may end this far apart.
-SOUND_SLACK_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -159,16 +157,12 @@ def _with_keyframes(motion: Motion, source: Path, keyframes: NDArray[np.bool_]) 
 
 def _sound_of(speech: Path, motion: Motion, encoder: SpeechEncoder, report: Reporter) -> tuple[F32, F32]:
     """Sound [S] at 48 kHz from the motion's first frame on, and the speech features [N, W] of its frames."""
-    sound, start_s = read_speech(speech)
+    times = motion.start_s + np.arange(len(motion.valid)) / motion.fps
+    sound, start_s = read_speech(speech, times[-1])
     offset_s = motion.sound_offset_s(sha256_file(speech))
+    times += offset_s
     if not offset_s and motion.provenance.get("av_offset_s"):
         report.say(f"{speech}: another sound than the motion's own, whose offset is not applied")
-    times = motion.start_s + offset_s + np.arange(len(motion.valid)) / motion.fps
-    end_s = start_s + len(sound) / FILM_RATE
-    if end_s < times[-1] - SOUND_SLACK_S:
-        raise UserError(
-            f"{speech}: its sound ends at {end_s:.2f} s, the motion at {times[-1]:.2f} s; give the whole recording"
-        )
     length_s = len(times) / motion.fps
     features = speech_features(speech, times, encoder)
     return on_video_clock(sound, start_s - times[0], length_s, FILM_RATE), features

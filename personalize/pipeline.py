@@ -69,6 +69,8 @@ def personalize_video(
     check_focal(settings.focal_px, (media.width, media.height))
     check_distortion(settings.focal_px, settings.distortion, (media.width, media.height))
     check_modes(settings.overlay)
+    if settings.tracked is not None and settings.focal_px is not None:
+        raise UserError("--focal, --distortion: the result given with --tracked has its own; leave them out")
     try:
         # Asked now, not after the tracking.
         available_device(settings.device)

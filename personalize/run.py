@@ -93,7 +93,9 @@ class RunFolder:
         except FileNotFoundError:
             raise UserError(f"{path}: no run.json there; give a folder made by `personalize VIDEO`") from None
         except (OSError, ValueError) as error:
-            raise UserError(f"{path}/run.json: cannot be read ({error})") from None
+            raise UserError(
+                f"{path}/run.json: cannot be read ({error}); delete the folder to begin anew"
+            ) from None
         if not _is_run(state):
             raise UserError(
                 f"{path}/run.json: not a run of this version of personalize; choose another --out"

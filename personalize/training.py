@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from model.checkpoint import Checkpoint
+from model.checkpoint import Checkpoint, is_checkpoint
 from model.dataset import Sequence, Standardization
 from model.denoiser import Architecture
 from model.errors import ModelError
@@ -23,7 +23,8 @@ from model.processes import joined
 from model.speech import SpeechEncoder, load_encoder
 from model.speech_windows import SpeechError
 from model.trainer import Trainer
-from model.training_config import TrainingConfig
+from model.training_config import TrainingConfig, available_device
+from personalize.animation import read_speech
 from personalize.corpus import Corpus, check_parts, tested, there
 from personalize.errors import UserError
 from personalize.files import sha256_file, sha256_json, write_text
@@ -65,6 +66,8 @@ def train_on_vocaset(
     Returns {"checkpoint", "modes", "held", "systems"}; held: share of the squared displacement that the basis holds;
     systems: see `compare_systems`. Raises UserError, in one line, for whatever the user can mend.
     """
+    with _mendable("--device"):
+        available_device(settings.device)  # asked now, not after all sound was read
     with _mendable(folder), joined(settings.device) as (rank, device):
         data = open_vocaset(folder)
         faces = read_faces(mesh, data.vertex_count)
@@ -72,7 +75,7 @@ def train_on_vocaset(
         check_parts(data, report)
         speech = load_encoder(settings.encoder)
         files = [mesh, *(path for pattern in VOCASET_FILES for path in folder.glob(pattern))]
-        work = _work_folder(out, _training_key(settings, speech, files), first=rank == 0)
+        work = _work_folder(out, _training_key(settings, speech, files), files, first=rank == 0)
         with report.stage("basis"):
             spoken = [(name, number) for name in speakers for number in data.sentences(name)]
             motion = motion_basis(
@@ -112,10 +115,12 @@ def train_on_motions(folder: Path, out: Path, settings: TrainSettings, report: R
 
     Returns {"checkpoint", "modes", "held"}. Raises UserError, in one line, for whatever the user can mend.
     """
+    with _mendable("--device"):
+        available_device(settings.device)  # asked now, not after all sound was read
     with _mendable(folder), joined(settings.device) as (rank, device):
         motions, speech = _read_motions(folder), load_encoder(settings.encoder)
         files = [folder / f"{name}.{kind}" for name in motions for kind in ("npz", "wav")]
-        work = _work_folder(out, _training_key(settings, speech, files), first=rank == 0)
+        work = _work_folder(out, _training_key(settings, speech, files), files, first=rank == 0)
         first = next(iter(motions.values()))
         with report.stage("basis"):
             basis = motion_basis(
@@ -222,10 +227,13 @@ def _decoded(motion: Motion) -> Iterator[F32]:
 def _motion_sequence(
     motion: Motion, basis: MotionBasis, sound: Path, encoder: SpeechEncoder, style: int
 ) -> Sequence:
-    """The motion in the new basis, with its sound, which is as late as its run found it."""
-    times = (
-        motion.start_s + motion.sound_offset_s(sha256_file(sound)) + np.arange(len(motion.valid)) / motion.fps
-    )
+    """The motion in the new basis, with its sound, which is as late as its run found it.
+
+    Raises UserError where nothing is heard, or not to the end.
+    """
+    times = motion.start_s + np.arange(len(motion.valid)) / motion.fps
+    read_speech(sound, times[-1])
+    times += motion.sound_offset_s(sha256_file(sound))
     coefficients = motion.coefficients @ basis.coefficients(motion.basis)
     return Sequence(coefficients, speech_features(sound, times, encoder), motion.valid, style)
 
@@ -236,14 +244,19 @@ def _training_key(settings: TrainSettings, speech: SpeechEncoder, files: Iterabl
     return sha256_json([settings.iterations, settings.seed, settings.architecture, speech.name, data])
 
 
-def _work_folder(out: Path, key: str, first: bool) -> Path:
+def _work_folder(out: Path, key: str, files: Iterable[Path], first: bool) -> Path:
     """`<out>.work`, made, the training's key beside what a continuation needs.
 
-    first: of several processes the one that writes. Raises UserError where the folder cannot be made, `out` is a
-    folder, or what was begun there is another training.
+    files: what is learned from. first: of several processes the one that writes. Raises UserError where the folder
+    cannot be made, `out` is a folder, one of the files or anything but a checkpoint, or what was begun there is another
+    training.
     """
     if out.is_dir():
         raise UserError(f"{out}: a folder; give --out the name of a file, as {out / 'model.safetensors'}")
+    if out.resolve() in {path.resolve() for path in files}:
+        raise UserError(f"{out}: is learned from; choose another --out")
+    if out.is_file() and not is_checkpoint(out):
+        raise UserError(f"{out}: is there already, and no checkpoint; choose another --out")
     work = out.with_name(f"{out.name}.work")
     key_file = work / "key"
     try:
@@ -274,9 +287,9 @@ def _provenance(source: str, settings: TrainSettings) -> dict[str, Any]:
 
 
 @contextmanager
-def _mendable(folder: Path) -> Iterator[None]:
-    """What the packages below say of the user's data, as the user's error."""
+def _mendable(given: Path | str) -> Iterator[None]:
+    """What the packages below say of what the user gave, as the user's error."""
     try:
         yield
     except (ModelError, MotionError, SpeechError) as error:
-        raise UserError(f"{folder}: {error}") from error
+        raise UserError(f"{given}: {error}") from error

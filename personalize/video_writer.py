@@ -44,6 +44,7 @@ class VideoWriter:
         self._fps = fps
         self._size = size
         self._count, self._last = 0, -1
+        self._partial.touch()  # where it may not be written, PyAV's own error does not say which
         self._container = av.open(str(self._partial), "w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(fps).limit_denominator(1001)
         options = _X264 | {"crf": str(crf), "preset": preset}

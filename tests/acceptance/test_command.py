@@ -76,6 +76,7 @@ def test_wrong_options_get_one_line(tmp_path: Path) -> None:
     edit = ("edit", "none.npz", "--subject", str(BASE_CHECKPOINT))
     assert_refused(personalize(*edit, cwd=tmp_path), "none.npz", "motion.npz")
     assert_refused(personalize(*edit, "--rule", "euler", cwd=tmp_path), "rule")
+    assert_refused(personalize(*edit, "--remake", ",", cwd=tmp_path), "--remake ','", "no part of the face")
 
 
 def test_an_encoder_a_device_a_focal_length_or_a_mode_that_is_not_there_gets_one_line_before_any_work(
@@ -92,6 +93,8 @@ def test_an_encoder_a_device_a_focal_length_or_a_mode_that_is_not_there_gets_one
     folding = ("--distortion=-5", "--focal", "100")
     assert_refused(personalize("run", video, *folding, cwd=tmp_path), "--distortion -5", "folds")
     assert_refused(personalize("run", video, "--seed", "-1", cwd=tmp_path), "--seed")
+    others = ("--tracked", tmp_path, "--focal", "100")
+    assert_refused(personalize("run", video, *others, cwd=tmp_path), "--focal", "--tracked")
     assert_refused(personalize("run", video, "--overlay", "shaded,wire", cwd=tmp_path), "wire:", "wireframe")
     assert_refused(
         personalize("run", video, "--until", "lunch", cwd=tmp_path), "--until lunch", "registration"

@@ -21,7 +21,7 @@ def test_without_transformers_one_line_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ModelError, match=r"pip install 'personalize\[encoders\]'") as caught:
+    with pytest.raises(ModelError, match=r"pip install -c constraints.txt -e '\.\[encoders\]'") as caught:
         load_encoder(tmp_path)
     assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
 

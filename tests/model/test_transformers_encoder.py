@@ -20,7 +20,7 @@ from model.speech_windows import SAMPLE_RATE, SpeechError
 from model.transformers_encoder import Framing, TransformersEncoder, find_folder, user_encoder
 from model.whisper_encoder import embedded_encoder
 
-transformers = pytest.importorskip("transformers", reason="needs pip install 'personalize[encoders]'")
+transformers = pytest.importorskip("transformers", reason="needs pip install -e '.[encoders]'")
 
 WIDTH, LAYERS = 32, 3
 MODELS = ("wav2vec2", "wav2vec2-stable", "hubert", "wavlm", "whisper")

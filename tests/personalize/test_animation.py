@@ -3,6 +3,7 @@
 import io
 import wave
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -82,3 +83,15 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_is_made(
     with pytest.raises(UserError, match="cannot be written; choose another --out"):
         animate(speech, subject, tmp_path / "a/b", samples=1)
     assert encoder.calls == 0 and not (tmp_path / "a").exists()
+
+
+def test_no_film_of_another_motion_stays_beside_a_new_one(
+    encoder: CountingEncoder, speech: Path, subject: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    film = tmp_path / "out/animation.mp4"
+    film.parent.mkdir()
+    film.write_bytes(b"earlier")
+    monkeypatch.setattr(animation, "write_film", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        animate(speech, subject, tmp_path / "out", samples=1)
+    assert film.with_name("motion.npz").is_file() and not film.exists()

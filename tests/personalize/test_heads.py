@@ -98,6 +98,7 @@ def test_wrong_files_are_refused_in_one_line(tmp_path: Path) -> None:
         assert message in refused(path, tmp_path / f"{name}.npz")
     good.unlink()
     assert "landmark embedding is needed" in refused(path)
+    assert "there is no file" in refused(tmp_path / "nowhere.pkl")
 
 
 @pytest.mark.parametrize(

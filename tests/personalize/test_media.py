@@ -505,6 +505,12 @@ def test_written_video_reads_back_with_its_sound(tmp_path: Path) -> None:
     assert data.index(b"moov") < data.index(b"mdat")
 
 
+def test_a_film_that_cannot_be_written_says_which(tmp_path: Path) -> None:
+    with pytest.raises(OSError) as caught:
+        VideoWriter(tmp_path / "nowhere/out.mp4", 25, (96, 64))
+    assert str(caught.value.filename) == str(tmp_path / "nowhere/.out.mp4.partial")
+
+
 def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     path = tmp_path / "out.mp4"
     path.write_bytes(b"earlier")

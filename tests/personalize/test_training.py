@@ -29,7 +29,7 @@ from personalize.files import sha256_file
 from personalize.mouth import mouth_regions
 from personalize.protocol import METRICS, SYSTEMS, Reference, first_seconds, with_noise
 from personalize.reporter import Reporter
-from personalize.sound import write_wav
+from personalize.sound import read_audio, write_wav
 from personalize.training import _motion_sequence, read_faces
 from personalize.vocaset import TEST, TRAIN, VAL
 from tests.model import talker
@@ -167,9 +167,29 @@ def test_tracked_motions_train_too(
     (tmp_path / "mended.safetensors.work/key").write_bytes(b"\xff\xfe")
     with pytest.raises(UserError, match="other settings or data"):
         train(tmp_path / "mended.safetensors", motions=folder, iterations=4)
+    samples = read_audio(folder / "bob.wav")[0]
+    for wrong, says in (
+        (samples[: len(samples) // 2], "its sound ends at"),
+        (0 * samples, "there is no sound"),
+    ):
+        write_wav(folder / "bob.wav", wrong)
+        with pytest.raises(UserError, match=rf"bob\.wav: {says}"):
+            train(tmp_path / "short.safetensors", motions=folder, iterations=4)
     (folder / "bob.wav").unlink()
     with pytest.raises(UserError, match=r"bob\.wav is missing"):
         train(tmp_path / "other.safetensors", motions=folder, iterations=4)
+
+
+def test_what_is_learned_from_and_what_is_no_checkpoint_is_not_written_over(
+    fake: FakeVocaset, tmp_path: Path
+) -> None:
+    folder, note = write_motions(fake, tmp_path / "motions"), tmp_path / "note.txt"
+    note.write_text("mine")
+    before = {path: path.read_bytes() for path in (*folder.iterdir(), note)}
+    for out, says in ((folder / "bob.npz", "is learned from"), (note, "is there already, and no checkpoint")):
+        with pytest.raises(UserError, match=says):
+            train(out, motions=folder, iterations=4)
+    assert {path: path.read_bytes() for path in (*folder.iterdir(), note)} == before
 
 
 def test_a_motions_sound_is_as_late_as_its_run_found_it(fake: FakeVocaset, tmp_path: Path) -> None:
@@ -191,6 +211,12 @@ def test_a_motions_sound_is_as_late_as_its_run_found_it(fake: FakeVocaset, tmp_p
         ({"vocaset": Path("a"), "motions": Path("b")}, "either --vocaset"),
         ({"vocaset": Path("a")}, "VOCAset holds no faces: give .*--template-mesh"),
         ({"motions": Path("nowhere")}, "no NAME.npz"),
+        (
+            {"motions": Path("a"), "template_mesh": Path("m.ply")},
+            "--template-mesh and --adapt go with --vocaset",
+        ),
+        ({"motions": Path("a"), "adapt": ["x"]}, "--template-mesh and --adapt go with --vocaset"),
+        ({"motions": Path("a"), "device": "tpu"}, "--device: device 'tpu' is not known"),
         ({"vocaset": Path("nowhere"), "template_mesh": Path("m.ply")}, "there is no folder"),
     ],
 )
