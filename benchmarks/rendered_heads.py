@@ -136,6 +136,17 @@ SCENES = (
         skin=(0.95, 0.90, 0.86),
         key_light=(-20.0, 30.0),
     ),
+    # A face of some thousand pixels, at a quarter of a metre.
+    Scene(
+        *("closeup", 21),
+        size=(1440, 1920),
+        focal=1.1,
+        face_px_per_m=7700.0,
+        head=0.5,
+        speech_start_s=9.0,
+        skin=(0.78, 0.72, 0.68),
+        key_light=(40.0, 30.0),
+    ),
 )
 
 
