@@ -64,7 +64,7 @@ def run_demo(out: Path, iterations: int, seed: int) -> dict[str, float]:
 def _is_truth(path: Path) -> bool:
     try:
         Truth.load(path)
-    except (OSError, ValueError, KeyError, BadZipFile):
+    except (OSError, EOFError, ValueError, KeyError, BadZipFile):
         return False
     return True
 

@@ -19,8 +19,7 @@ def kept_share(
     """Names of regions to keep, or of those to make anew -> share [D] f32, 1 kept .. 0 made anew; None without names.
 
     What is named is kept or made anew wholly; from its border outwards the share changes linearly over `blend_m` along
-    the surface. Raises UserError for an unknown name, and where both kinds are named, or no
-    width.
+    the surface. Raises UserError for an unknown name, for names of both kinds, and for a width that is none.
     """
     keep, remake = tuple(keep), tuple(remake)
     if not np.isfinite(blend_m):

@@ -9,7 +9,8 @@ from personalize import demo
 
 
 @pytest.mark.parametrize(
-    ("film", "truth"), [(None, None), (b"film", b"garbage"), (b"film", b"PK\x03\x04"), (None, b"x")]
+    ("film", "truth"),
+    [(None, None), (b"film", b""), (b"film", b"garbage"), (b"film", b"PK\x03\x04"), (None, b"x")],
 )
 def test_a_film_without_its_truth_is_rendered_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, film: bytes | None, truth: bytes | None
