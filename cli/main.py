@@ -102,7 +102,7 @@ def main() -> None:
     except UserError as error:
         code = INTERRUPTED if interruptions else INPUT_ERROR
         if code == INPUT_ERROR:
-            typer.echo(f"personalize: {error}", err=True)
+            typer.echo(f"personalize: {error}".replace("\n", " "), err=True)  # a file may be named so
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except Exception as error:

@@ -67,6 +67,12 @@ def test_what_is_no_video_is_refused_and_leaves_nothing(
     assert sorted(tmp_path.iterdir()) == before
 
 
+def test_a_name_of_two_lines_gets_one(tmp_path: Path) -> None:
+    result = personalize("two\nlines.mp4", cwd=tmp_path)
+    assert_refused(result, "two lines.mp4", "no such file")
+    assert len(result.stderr.splitlines()) == 1
+
+
 def test_wrong_options_get_one_line(tmp_path: Path) -> None:
     assert_refused(personalize("run", "talk.mp4", "--iterations", "none", cwd=tmp_path), "iterations")
     assert_refused(personalize("animate", "speech.wav", "--subject", "nowhere", cwd=tmp_path), "nowhere")
