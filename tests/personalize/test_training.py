@@ -81,6 +81,17 @@ def test_the_whole_protocol_on_both_layouts(
     assert "personalized" in shown and "(1.56)" in shown and "modes hold" in shown
 
 
+def test_without_a_test_subject_there_are_no_tables(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    some = FakeVocaset({name: numbers for name, numbers in SENTENCES.items() if name not in TEST})
+    mesh, folder = some.write_mesh(tmp_path / "sample.ply"), some.write_training_files(tmp_path / "a")
+    train(tmp_path / "a.safetensors", folder, mesh, iterations=2, json_=True)
+    said = capsys.readouterr()
+    assert json.loads(said.out)["systems"] == [] and "none of the test subjects" in said.err
+    assert Checkpoint.load(tmp_path / "a.safetensors").kind == "base"
+
+
 def test_it_goes_on_where_it_stopped(
     fake: FakeVocaset,
     tmp_path: Path,
