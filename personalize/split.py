@@ -9,9 +9,7 @@ import numpy as np
 from personalize.shots import F64, Bool, Frames, covered, usable_seconds
 
 PARTS = (("train", 0.5), ("val", 0.75), ("test", 1.0))  # each up to this share of the usable time
-GUARD_S = (
-    0.2  # left out about a boundary inside a shot, half on each side: neighbouring frames are nearly equal
-)
+GUARD_S = 0.2  # left out about a boundary inside a shot: neighbouring frames are nearly equal
 SEARCH_SHARE = 0.04  # a boundary moves to a cut within this share of the usable time
 
 
