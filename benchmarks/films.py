@@ -110,7 +110,10 @@ class Studio:
         self._focal = scene.focal * max(self._large)
         self._backdrop = backdrop(self._large, scene.seed)
         self._block = skin_block(scene.seed)
-        self._props = [props.glasses(person)] if scene.glasses else []
+        self._props = [props.beard(person, scene.hair)] if scene.beard else []
+        grown = len(self._props)
+        if scene.glasses:
+            self._props.append(props.glasses(person))
         if scene.fringe:
             self._props.append(props.hair(person, scene.hair))
         if scene.hand:
@@ -120,7 +123,7 @@ class Studio:
             parts.append(prop.faces + first)
             first += len(prop.vertices)
         self._faces = np.concatenate(parts).astype(np.int32)
-        self._own = len(parts[0])
+        self._own = sum(len(part) for part in parts[: 1 + grown])
         self._inside = mouth.within(person)
         self._albedo = np.concatenate([_painted(person, scene), *(prop.albedo for prop in self._props)])
         self._places = np.concatenate([person.template, *(p.vertices for p in self._props)]).astype(
@@ -140,7 +143,8 @@ class Studio:
 
         Lips outside the picture count as covered where none are in it.
         """
-        whole = np.concatenate([vertices, *(prop.at(frame / FPS) for prop in self._props)])
+        moved = vertices - self._person.template
+        whole = np.concatenate([vertices, *(prop.at(frame / FPS, moved) for prop in self._props)])
         posed = (self._turns[frame].apply(whole) + self._moves.translation[frame]).astype(np.float32)
         centre = [(side - 1) / 2 for side in self._large]
         pixels = np.concatenate([project(posed, self._focal, centre), posed[:, 2:]], axis=1)

@@ -1,10 +1,11 @@
-"""Things in front of a face: glasses, hair and a hand, made of tubes in the head frame."""
+"""Things in front of a face: glasses, hair, a beard and a hand, made of tubes in the head frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
@@ -19,6 +20,10 @@ FRAME_COLOUR = (28.0, 24.0, 26.0)  # of the glasses, sRGB
 HAND_COLOUR = (205.0, 165.0, 148.0)
 FRINGE, LOCKS = 260, 130  # strands over the forehead, and down each cheek
 STRAND_M = 0.0006
+BRISTLES = 2400  # of a beard
+MOUSTACHE_M, BEARD_M = (0.006, 0.010), (0.007, 0.013)  # how long they are
+MOUSTACHE_HALF_M, ABOVE_LIPS_M = 0.03, 0.011  # where it grows
+CHEEK_LINE = 1.5  # by how much it rises beside that
 STRAND_SHADES = 0.25  # standard deviation of a strand's brightness, as a share
 
 
@@ -26,16 +31,20 @@ STRAND_SHADES = 0.25  # standard deviation of a strand's brightness, as a share
 class Prop:
     """A mesh in the head frame: vertices [V, 3] m, faces [F, 3], albedo [V, 3] sRGB.
 
-    moves: comes to the face and goes again.
+    moves: comes to the face and goes again. grown: [V] vertices of the head along with which its own move; None if it
+    stays where it is.
     """
 
     vertices: F64
     faces: NDArray[np.int32]
     albedo: F64
     moves: bool = False
+    grown: NDArray[np.int64] | None = None
 
-    def at(self, time: float) -> F64:
-        """[V, 3] m at a time, s."""
+    def at(self, time: float, moved: NDArray[np.floating]) -> F64:
+        """[V, 3] m at a time, s, of a head whose vertices have moved [D, 3] m."""
+        if self.grown is not None:
+            return self.vertices + moved[self.grown]
         if not self.moves:
             return self.vertices
         start, ramp, hold = HAND_S
@@ -116,6 +125,33 @@ def hair(head: HeadModel, colour: ArrayLike) -> Prop:
         strands.append(strand(x, lips[1] - random.uniform(0.02, 0.06)))
     shades = 1 + STRAND_SHADES * random.normal(size=(len(strands), 1))
     return _joined(strands, np.clip(255 * np.asarray(colour) * shades, 0, 255))
+
+
+def beard(head: HeadModel, colour: ArrayLike) -> Prop:
+    """Bristles of a head (its template) on upper lip, cheeks and chin, over the edge of the upper lip. colour: as hair.
+
+    They go along with the skin.
+    """
+    random = np.random.default_rng(8)
+    lips, around = head.regions["lips"], np.setdiff1d(head.regions["face"], head.regions["lips"])
+    grows = np.isin(np.arange(len(head.template)), around)
+    skin = trimesh.Trimesh(head.template, head.faces[grows[head.faces].all(1)], process=False)
+    roots, triangle = trimesh.sample.sample_surface(skin, 12 * BRISTLES, seed=8)
+    top = head.template[lips, 1].max()
+    aside = np.abs(roots[:, 0]) - MOUSTACHE_HALF_M
+    line = top + np.where(aside < 0, ABOVE_LIPS_M, np.maximum(0, CHEEK_LINE * (aside - 0.01)))
+    chosen = np.flatnonzero((roots[:, 1] < line) & (skin.face_normals[triangle, 2] > 0.1))[:BRISTLES]
+    tubes = []
+    for root, normal in zip(roots[chosen], skin.face_normals[triangle[chosen]]):
+        upper = root[1] > top - 0.004 and abs(root[0]) < MOUSTACHE_HALF_M
+        way = 0.5 * normal + [0.3 * np.sign(root[0]), -1, 0] + random.normal(0, 0.15, 3)
+        length = random.uniform(*(MOUSTACHE_M if upper else BEARD_M))
+        points = root + np.linspace(0, length, 5)[:, None] * way / np.linalg.norm(way)
+        tubes.append(tube(points, STRAND_M / 2 * np.array([1, 1, 1, 1, 0])))
+    shades = 1 + STRAND_SHADES * random.normal(size=(len(tubes), 1))
+    prop = _joined(tubes, np.clip(255 * np.asarray(colour) * shades, 0, 255))
+    near = KDTree(head.template[around]).query(roots[chosen])[1]
+    return replace(prop, grown=np.repeat(around[near], [len(vertices) for vertices, _ in tubes]))
 
 
 def hand(head: HeadModel, skin: ArrayLike) -> Prop:

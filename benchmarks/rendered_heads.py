@@ -23,11 +23,9 @@ FPS = 25.0
 SPEECH = ASSETS / "demo_speech.json"
 WAVES, BEND_LENGTH_M, WARP_LENGTH_M = 24, 0.05, 0.04
 FACE_DEPTH_M = 0.085  # of the face before the head's origin
-TURN_S, TURN_BACK_S, TURN_RISE_S = (
-    2.5,
-    2.74,
-    0.2,
-)  # of the fast head turn: when, when back, how long each takes
+# When the head turns, when it turns back, and how long each takes, s: fast, and slowly aside to the left and right.
+FAST_TURN = (2.5, 2.74, 0.2)
+ASIDE_TURNS = ((1.0, 2.6, 1.0), (4.4, 6.0, 1.0))
 CUT_S = 2.0  # that are missing at a cut
 LIP_ROLL = 0.4  # of the demo's: lower lips on real film hardly roll in, not at /f v/ either
 Colour = tuple[float, float, float]
@@ -51,6 +49,8 @@ class Scene:
     head: float = 0.8
     """Range of head movement; 1 turns by up to 17 degrees to either side."""
     fast_turn_deg: float = 0.0
+    aside_deg: float = 0.0
+    """How far the head turns slowly to either side."""
     shot_s: float = np.inf
     """After so long there is a cut: CUT_S of what happens are not filmed."""
     speaks: bool = True
@@ -68,6 +68,8 @@ class Scene:
     gloss: float = 0.08
     fringe: bool = False
     """Hair to the brows, and over the edges of both cheeks."""
+    beard: bool = False
+    """Bristles on cheeks, chin and upper lip, over whose edge they hang."""
     glasses: bool = False
     hand: bool = False
     shutter: float = 0.35
@@ -125,6 +127,27 @@ SCENES = (
         hair=(0.36, 0.25, 0.17),
         fringe=True,
         key_light=(25.0, 35.0),
+    ),
+    Scene(
+        *("beard", 23),
+        focal=1.4,
+        head=0.7,
+        speech_start_s=10.0,
+        skin=(0.93, 0.88, 0.84),
+        hair=(0.22, 0.15, 0.10),
+        stubble=0.3,
+        beard=True,
+        key_light=(15.0, 40.0),
+    ),
+    # Into profile and back, to either side, as somebody does who films a head for a model of it.
+    Scene(
+        *("profile", 22, 8.0),
+        focal=1.3,
+        head=0.5,
+        aside_deg=70.0,
+        speech_start_s=27.0,
+        skin=(0.90, 0.84, 0.80),
+        key_light=(-30.0, 30.0),
     ),
     # A phone at arm's length: the face is 560 px wide.
     Scene(
@@ -221,7 +244,9 @@ def scene_motion(scene: Scene) -> TalkerMotion:
             translation=np.broadcast_to(motion.translation[0], motion.translation.shape),
             eyes=np.broadcast_to(motion.eyes[0], motion.eyes.shape),
         )
-    return _turned(motion, np.radians(scene.fast_turn_deg) * _there_and_back(len(motion.expression)))
+    left, right = (_there_and_back(len(motion.expression), turn) for turn in ASIDE_TURNS)
+    fast = _there_and_back(len(motion.expression), FAST_TURN)
+    return _turned(motion, np.radians(scene.fast_turn_deg * fast + scene.aside_deg * (left - right)))
 
 
 def _phones(start: float) -> list[Phone]:
@@ -236,10 +261,10 @@ def _cut(motion: TalkerMotion, shot_s: float) -> TalkerMotion:
     return replace(motion, **{name: getattr(motion, name)[kept] for name in names})
 
 
-def _there_and_back(frames: int) -> F64:
-    """[T] 0, quickly up to 1, and quickly back."""
-    time = np.arange(frames) / FPS
-    there, back = (np.clip((time - moment) / TURN_RISE_S, 0, 1) for moment in (TURN_S, TURN_BACK_S))
+def _there_and_back(frames: int, turn: tuple[float, float, float]) -> F64:
+    """[T] 0, up to 1 at one time, and back at another: when, when back, and how long each takes, s."""
+    time, (there_s, back_s, rise_s) = np.arange(frames) / FPS, turn
+    there, back = (np.clip((time - moment) / rise_s, 0, 1) for moment in (there_s, back_s))
     return 0.5 * (np.cos(np.pi * back) - np.cos(np.pi * there))
 
 

@@ -29,6 +29,8 @@ MIDDLE_M = 3e-4  # from the face's middle
 CLOSED_MM = 0.5
 AJAR_MM = CLOSED_MM + 0.3  # true lips hover about the limit, and openings may err by so much
 COVERED = 0.2  # share of the lips from which a frame counts as covered
+ASIDE_DEG = 45.0  # of the face's axis from the line of sight: half of the lips is hidden
+NEAR_DEG = 30.0  # below, a head that was turned aside counts as turned back
 FAST_DEG = 4.0  # head rotation a frame from which a turn counts as fast
 RECOVERED = 1.5  # times the median error
 STILL_M = 1e-5  # a head that moves by less stands still
@@ -40,12 +42,13 @@ Similarity = tuple[F64, F64, F64]
 def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, float]:
     """Errors by name: mm, degrees, frames, shares, or r for correlations; NaN where the clip cannot tell.
 
-    Frames in which something covers the lips count for confidence and recovery alone; bare ones that have no
-    fit for recovery and as lost_pct, their share in %. left_out_pct, kept_pct: of the bare ones that have a fit and of
-    the covered ones, the share that is left out and used by default, %.
+    Frames in which the lips are hidden, because something covers them or the head is turned aside, count for confidence
+    and recovery alone; others that have no fit for recovery and as lost_pct, their share in %. left_out_pct, kept_pct:
+    of those in which they are seen that have a fit and of the hidden ones, the share that is left out and used by
+    default, %.
     """
     fitted = axis_angle_to_rotation_matrix(from_numpy(track.rotation.astype(np.float64))).numpy()
-    bare = truth.covered <= COVERED
+    bare = (truth.covered <= COVERED) & (aside_deg(truth) <= ASIDE_DEG)
     judged = track.valid & bare
     used = track.valid & (track.confidence >= Settings().min_confidence)
     resting = np.zeros(len(head.expression_names), np.float32)
@@ -220,11 +223,17 @@ def separation(confidence: NDArray[np.floating], covered: Bool) -> float:
     return float((ranks.sum() - count * (count + 1) / 2) / (count * others))
 
 
+def aside_deg(truth: GroundTruth) -> F64:
+    """[T] angle between the true face's axis and the line from the head to the camera, degrees."""
+    sight = -truth.translation / np.linalg.norm(truth.translation, axis=1, keepdims=True)
+    return np.degrees(np.arccos(np.clip((truth.rotation[:, :, 2] * sight).sum(1), -1, 1)))
+
+
 def disturbed(truth: GroundTruth) -> Bool:
-    """[T] frames in which the lips are covered or the head turns fast."""
+    """[T] frames in which the lips are covered, the head turns fast, or is turned aside."""
     step = truth.rotation[1:] @ truth.rotation[:-1].transpose(0, 2, 1)
     fast = np.concatenate([[False], _angle_deg(step) > FAST_DEG])
-    seen = fast | (truth.covered > COVERED)
+    seen = fast | (truth.covered > COVERED) | (aside_deg(truth) > NEAR_DEG)
     return seen | binary_closing(seen, iterations=2)  # a turn's far end belongs to it
 
 

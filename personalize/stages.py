@@ -51,7 +51,7 @@ def speech_model_assets(settings: Settings) -> dict[str, str]:
 class Ingest(Stage):
     """Video -> times, usable frames and why not, sound, split."""
 
-    name, version, needs = "ingest", 11, (VIDEO,)
+    name, version, needs = "ingest", 12, (VIDEO,)
     makes = ("media.json", "frames.npz", "audio.wav", "split.json")
 
     def make(self, context: Context, folder: Path) -> None:
@@ -71,7 +71,7 @@ class Ingest(Stage):
 class LandmarkStage(Stage):
     """478 points and 52 scores on every frame that shows the face, what covers or blurs it, and rigid features."""
 
-    name, version = "landmarks", 8
+    name, version = "landmarks", 9
     needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz", "features.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -91,7 +91,7 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 12, ("focal_px", "distortion")
+    name, version, reads = "camera", 13, ("focal_px", "distortion")
     needs = ("ingest/media.json", "landmarks/landmarks.npz", "landmarks/features.npz")
     makes = ("camera.json", "bundle.npz")
 
@@ -115,7 +115,7 @@ class CameraStage(Stage):
 class TrackStage(Stage):
     """One identity, and expression, pose and gaze in every frame, jointly over the clip."""
 
-    name, version = "track", 12
+    name, version = "track", 13
     needs = (
         *("ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz"),
@@ -144,7 +144,7 @@ class TrackStage(Stage):
 class Refine(Stage):
     """The track again, with the grey levels of the skin."""
 
-    name, folder, version = "refine", "photometric", 27
+    name, folder, version = "refine", "photometric", 28
     needs = (
         *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),

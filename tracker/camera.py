@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tracker.bundle_adjustment import RigidScene, absolute_pose, adjust, camera_model
-from tracker.feature_tracks import FeatureTracks, turning
-from tracker.head import HeadModel, LandmarkEmbedding
+from tracker.feature_tracks import FeatureTracks, turned_as_usual, turning
+from tracker.head import HeadModel
 from tracker.key_frames import farthest
-from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, STEADY_CORNERS, UPPER_FACE
+from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, of_rigid_face
 from tracker.rigid_surface import SurfacePoints, surface_points
 from tracker.similarity import similarity
 from tracker.track import F64, Bundle, Camera, Landmarks
@@ -39,7 +39,6 @@ MIN_TURN_DEG = 8.0  # a head that turns less leaves focal length and depth undec
 # Of the distance between the outer eye corners: farther landmarks, and points that were followed, do not count for a
 # frame's pose.
 OUTLIER, TRACK_OUTLIER = 0.08, 0.02
-FEW = 20  # landmarks of the upper face: a user's sparse embedding has less, and most of them on the nose's ridge
 MIN_OBSERVATIONS = 12  # of a frame in the bundle
 MIN_LENGTH = 3  # observations of a point in the bundle
 ADJUSTED, MOST_POINTS = 250, 600  # frames and points adjusted together: the time grows by their squares
@@ -61,7 +60,7 @@ def estimate_camera(
     length, on film 36 mm wide; 0 if nothing.
     """
     prior = _camera(landmarks.size, focal_given, distortion, recorded_mm)
-    tracks = _straight(features, prior)
+    tracks = _not_aside(_straight(features, prior), landmarks)
     some = tracks.select(_telling(landmarks.points[tracks.frames]), MOST_POINTS)
     start, surface, kept = _start(some, landmarks, head, prior)
     if not len(kept):
@@ -98,6 +97,14 @@ def _straight(tracks: FeatureTracks, camera: Camera) -> FeatureTracks:
     """What was followed as a camera without distortion would see it."""
     seen = camera.lens.points(tracks.observations[:, 2:])
     return replace(tracks, observations=np.concatenate([tracks.observations[:, :2], seen], axis=1))
+
+
+def _not_aside(tracks: FeatureTracks, landmarks: Landmarks) -> FeatureTracks:
+    """What was followed into frames in which the head is not turned much farther aside than it is usual."""
+    if not len(tracks.frames):
+        return tracks
+    frames = tracks.frames[turned_as_usual(landmarks.points[tracks.frames])]
+    return FeatureTracks(frames, tracks.observations[np.isin(tracks.observations[:, 0], frames)])
 
 
 def _camera(
@@ -146,7 +153,7 @@ def _start(
     Frames and points that see, or are seen, too little are left out.
     """
     embedding = head.landmark_embedding
-    rigid = rigid_landmarks(embedding)
+    rigid = of_rigid_face(embedding.landmarks)
     mean = np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis))
     surface = head.landmark_positions(*mean)[rigid].astype(np.float64)
     xy = camera.lens.points(landmarks.points[tracks.frames][:, embedding.landmarks[rigid], :2])
@@ -166,12 +173,6 @@ def _start(
     )
     pruned, kept = _pruned(scene)
     return pruned, points.select(kept), kept
-
-
-def rigid_landmarks(embedding: LandmarkEmbedding) -> NDArray[np.bool_]:
-    """[L] which of a head's landmarks lie on the rigid upper face; with few of those, corners of eyes and nose too."""
-    upper = np.isin(embedding.landmarks, UPPER_FACE)
-    return upper if upper.sum() > FEW else upper | np.isin(embedding.landmarks, STEADY_CORNERS)
 
 
 def _pruned(scene: RigidScene) -> tuple[RigidScene, NDArray[np.int64]]:

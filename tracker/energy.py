@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from tracker.jacobian import fill_rows
+from tracker.landmark_indices import of_rigid_face
 from tracker.modes import Modes, head_modes, movements
 from tracker.track import F64
 
@@ -102,6 +103,11 @@ class LandmarkModel:
     def expressions(self) -> int:
         """Number of modes."""
         return len(self.modes)
+
+    @property
+    def upper_face(self) -> F64:
+        """[U, 3] m, the landmarks of the rigid upper face on the mean head."""
+        return self.mean[of_rigid_face(self.landmarks)]
 
     def of_lids(self) -> NDArray[np.bool_]:
         """[K] modes that move nothing more than a lid's rim."""

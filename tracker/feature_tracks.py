@@ -24,6 +24,7 @@ AROUND = 48.0  # px around the upper face: patches' halves, their search and wha
 REACH = 0.35  # eye distances, of the landmarks that carry a patch along
 MIN_SHRINK = 0.3  # of its area: a patch seen more aslant is not looked for
 MIN_LENGTH = 5  # observations of a track that is kept
+ASIDE = 0.45  # eye distances, of the nose's tip: a turn of some 33 degrees
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,16 @@ def turning(points: NDArray[np.floating]) -> NDArray[np.floating]:
     nose = points[:, 1, :2] - (left + right) / 2
     size = (across**2).sum(1, keepdims=True)
     return np.stack([(nose * across).sum(1), (nose * down).sum(1)], axis=1) / size
+
+
+def turned_as_usual(points: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Rows of landmarks [n, 478, 2 or 3], at least one of any, in which the head is turned about as it usually is.
+
+    Not farther aside than landmarks and patches are to be believed, which err there by more than they tell.
+    """
+    turn = turning(points).astype(np.float64)
+    usual = turn[np.linalg.norm(turn - np.median(turn, axis=0), axis=1).argmin()]
+    return np.flatnonzero(np.linalg.norm(turn - usual, axis=1) <= ASIDE)
 
 
 def _long_tracks(observations: NDArray[np.float64]) -> F32:

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tracker.appearance import skin_triangles
-from tracker.camera import rigid_landmarks
 from tracker.flame_regions import regions_of
 from tracker.head import HeadModel, Joint, LandmarkEmbedding
-from tracker.landmark_indices import IRIS_CENTRES, POINTS
+from tracker.landmark_indices import IRIS_CENTRES, POINTS, of_rigid_face
 from tracker.skinning import JAW, LEFT_EYE, NECK, RIGHT_EYE, Skeleton
 from tracker.track import F32, TrackError
 
@@ -165,7 +164,7 @@ def _check_area(points: SurfacePoints, template: NDArray[np.float64], faces: NDA
 def _check_rigid(
     embedding: LandmarkEmbedding, template: NDArray[np.float64], faces: NDArray[np.int32]
 ) -> None:
-    rigid = rigid_landmarks(embedding)
+    rigid = of_rigid_face(embedding.landmarks)
     count = int(rigid.sum())
     if count < LEAST_RIGID:
         raise TrackError(

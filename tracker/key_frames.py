@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from tracker.feature_tracks import turning
+from tracker.feature_tracks import turned_as_usual, turning
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER
 from tracker.track import F64
 
@@ -53,7 +53,15 @@ class KeyFrames:
 
 
 def key_frames(observed: F64, px_per_m: F64, count: int = KEY_FRAMES) -> KeyFrames:
-    """`count` frames at most, fewer of a short clip, REST_SHARE of them at rest. observed: [n, 478, 2] px."""
+    """`count` frames at most, fewer of a short clip, REST_SHARE of them at rest. observed: [n, 478, 2] px, n > 0.
+
+    None of them is turned much farther aside than it is usual.
+    """
+    usual = turned_as_usual(observed)
+    return _key_frames(observed[usual], px_per_m[usual], count).of(usual)
+
+
+def _key_frames(observed: F64, px_per_m: F64, count: int) -> KeyFrames:
     n = len(observed)
     opening = np.linalg.norm(observed[:, 13] - observed[:, 14], axis=-1) / px_per_m
     lips = (observed[:, [61, 291, 13, 14]] - observed[:, [1]]) / px_per_m[:, None, None]

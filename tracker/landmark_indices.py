@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 POINTS = 478
 RIGHT_EYE_OUTER, LEFT_EYE_OUTER = 33, 263  # the subject's
@@ -64,6 +65,7 @@ _NOSE = (168, 6, 197, 195, 5, 4, 1, 19, 94, 2, 122, 351, 188, 412, 48, 278, 64, 
 UPPER_FACE = (*_FOREHEAD, *_TEMPLES, *_CHEEKS, *_NOSE)
 # Corners of eyes and nose: they move little, and a sparse embedding has them.
 STEADY_CORNERS = (33, 133, 362, 263, 129, 358, 98, 327, 97, 326, 75, 305)
+FEW = 20  # landmarks of the upper face: a user's sparse embedding has less, and most of them on the nose's ridge
 
 # Of iBUG's 68 points those that stay on the skin, 17-67: brows, nose, eyes, outer and inner lips, each from the
 # subject's right to the left, or around from the right corner over the top.
@@ -87,3 +89,9 @@ OVAL = (
     *(10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377, 152),
     *(148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109),
 )
+
+
+def of_rigid_face(landmarks: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """[L] which of some landmarks, by number, lie on the rigid upper face; with few, corners of eyes and nose too."""
+    upper = np.isin(landmarks, UPPER_FACE)
+    return upper if upper.sum() > FEW else upper | np.isin(landmarks, STEADY_CORNERS)

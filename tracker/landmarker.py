@@ -36,6 +36,10 @@ from tracker.track import F32, STEP_S, Landmarks
 INPUT_SIZE = 256  # px, side of the landmark network's square input
 MARGIN = 1.5  # side of the region over the long side of the face's box
 MIN_PRESENCE = 0.5  # below, the face counts as lost
+# How far a crop and its mirror image may be read apart, as a share of the face, and what halves the presence. Faces
+# that are seen at all are below .02 but for a hand on them (.03); in profile, on which one network alone invents a
+# face, .05 to .26 are usual.
+APART, APART_HALF = 0.02, 0.04
 SEARCH_INTERVAL = 10  # frames between searches in tiles while no face is found: each is dozens of detections
 # Share of the new frame's region in the smoothed one, STEP_S after the last. A region that jumps adds jitter, one that
 # lags costs up to .5 px where a face crosses its own width in a second.
@@ -151,13 +155,21 @@ class FaceLandmarker:
         mirrored, mirrored_logit = reading.result()
         mirrored = mirrored[MIRRORED]
         mirrored[:, 0] = 1 - mirrored[:, 0]
+        agreed = agreement(unit, mirrored)
         unit = (unit + mirrored) / 2
         to_picture = roi.to_picture()
         xy = unit[:, :2] @ to_picture[:, :2].T + to_picture[:, 2]
         points = np.column_stack([xy, unit[:, 2] * roi.side]).astype(np.float32)
         (scores,) = self._blendshapes(points[None, BLENDSHAPE_INPUT, :2])
         presence = 1.0 / (1.0 + np.exp(-(logit + mirrored_logit) / 2))
-        return points, float(presence), scores.reshape(52)
+        return points, float(presence) * agreed, scores.reshape(52)
+
+
+def agreement(one: F32, other: F32) -> float:
+    """0..1, less the farther two readings [478, 3] of one face lie apart."""
+    xy = (one + other)[:, :2] / 2
+    apart = np.linalg.norm((one - other)[:, :2], axis=1).mean() / np.ptp(xy, axis=0).max()
+    return float(np.exp2(-max(apart - APART, 0.0) / (APART_HALF - APART)))
 
 
 class _Network:

@@ -84,20 +84,28 @@ def _share(apart: float, certain: float, focal_sd_log: float) -> float:
 
 
 def hold_poses(
-    x: F64, bundle: Bundle, good: Rows, run: NDArray[np.int64], time: F64, sound: Rows, share: float = 1.0
+    x: F64,
+    bundle: Bundle,
+    good: Rows,
+    run: NDArray[np.int64],
+    time: F64,
+    sound: Rows,
+    middle: F64,
+    share: float = 1.0,
 ) -> F64:
     """The unknowns x [n, P] of the frames good [n] with their poses moved by a share of the way to the bundle's.
 
     run: [n], frames of one number follow each other without a break; nothing is carried from one to another.
     time: [n] s. sound: rows of x whose poses tell how the two head frames lie to each other, and where the
-    difference is known.
+    difference is known. middle: [3] m, of the rigid upper face in the model's head frame: there the two agree, since
+    what the rest of a face does, and a beard on it, tells nothing of where the skull is.
     """
     known = np.isin(bundle.frame, good[sound]) & _well_seen(bundle)
     row = np.searchsorted(good, bundle.frame[known])
     if not share or len(row) < MIN_FRAMES:
         return x
     rotation = Rotation.from_rotvec(bundle.rotation[known]).as_matrix()
-    change = _corrections(x[row], rotation, bundle.translation[known].astype(np.float64))
+    change = _corrections(x[row], rotation, bundle.translation[known].astype(np.float64), middle)
     step = np.diff(time[row])
     ends = np.flatnonzero((step > 1.5 * np.median(step)) | (np.diff(run[row]) != 0)) + 1
     stretches: dict[int, Corrections] = {}
@@ -121,20 +129,21 @@ def _well_seen(bundle: Bundle) -> NDArray[np.bool_]:
     return seen >= LEAST_SEEN * (np.median(seen) if len(seen) else 0.0)
 
 
-def _corrections(x: F64, rotation: F64, translation: F64) -> F64:
+def _corrections(x: F64, rotation: F64, translation: F64, middle: F64) -> F64:
     """[m, 6] turn (axis-angle, rad, camera frame) and shift (m) from the poses in x [m, P] to the bundle's.
 
     The bundle's head frame is taken to the model's by the similarity under which the two are closest.
     """
-    own, place = rotation_matrix(x[:, -6:-3]), x[:, -3:]
+    own = rotation_matrix(x[:, -6:-3])
+    place = x[:, -3:] + own @ middle
     u, _, vt = np.linalg.svd((own.transpose(0, 2, 1) @ rotation).mean(0))
     target = rotation @ (u @ vt).T
-    # The model's centre stands still in the bundle's frame, whose scale is its own: place = rotation c + s translation.
+    # The face's middle stands still in the bundle's frame, whose scale is its own: place = rotation c + s translation.
     system = np.concatenate([rotation, translation[..., None]], axis=2)
     told = np.linalg.lstsq((CERTAIN * system).reshape(-1, 4), (CERTAIN[:, 0] * place).reshape(-1), rcond=None)
-    moved = system @ told[0]
+    moved = system @ told[0] - target @ middle
     turn = Rotation.from_matrix(target @ own.transpose(0, 2, 1)).as_rotvec()
-    return np.concatenate([turn, moved - place], axis=1)
+    return np.concatenate([turn, moved - x[:, -3:]], axis=1)
 
 
 def _between(stretches: Corrections, time: F64) -> F64:

@@ -14,14 +14,15 @@ from tracker.jacobian import fill_rows
 from tracker.key_frames import KeyFrames
 from tracker.photometric import PhotometricEnergy
 from tracker.skin_fit import Subject, grey_noise
-from tracker.solver import solve_subject
+from tracker.solver import PosesHeld, Smoothness, solve_frames, solve_subject
 from tracker.track import F32, F64
 from tracker.view import U8, Index
 
 EVIDENCE = 3.0  # of the grey levels, times theirs in the fit of one frame
 STEPS = 1  # of Gauss and Newton at each blur: a second one tells no more
 # As the logarithm of how much it differs from frame to frame: chance alone makes such a difference.
-LESS_ALIKE = 0.04
+LESS_ALIKE = 0.07
+REFITTING = 3  # steps of expressions under poses that are held
 BLOCK = 256  # points whose rows of all key frames are held at once
 
 
@@ -147,19 +148,26 @@ def fit_identity_to_skin(subject: Subject, cuts: Mapping[int, U8], keys: KeyFram
 
 
 def nearer_to_skin(subject: Subject, cuts: Mapping[int, U8], rows: Index, x: F64, other: F64) -> float:
-    """0..1, how surely the skin in the frames `rows` looks as much alike where `other` [n, U] puts it as where x does.
+    """0..1, how surely skin in the frames `rows` looks as much alike under the poses in `other` [n, U] as under x's.
 
-    1 if it does, 0 from LESS_ALIKE on. cuts: the frames' faces, by rows. Each of the two is asked what it believes of
-    light and noise, and both are judged by either.
+    1 if it does, 0 from LESS_ALIKE on. cuts: the frames' faces, by rows. The skin above the mouth is asked, and where
+    each pose has it: with expressions that fit the landmarks under that pose. Each of the two is asked what it believes
+    of light and noise, and both are judged by either.
     """
-    both, moves = (x[rows], other[rows]), _movements(subject)
-    identity = subject.identity.astype(np.float64)
+    identity, moves = subject.identity.astype(np.float64), _movements(subject)
+    landmarks = subject.energy.select(rows)
+    held, alone = PosesHeld(landmarks), Smoothness.none(len(rows), x.shape[1])
+    shape = landmarks.shape(identity)
+    both = tuple(solve_frames(held, shape, at[rows], alone, steps=REFITTING) for at in (x, other))
+    upper = subject.skin.rest[:, 1] > landmarks.model.upper_face[:, 1].min()
     mean = replace(subject.skin, rest=subject.skin.rest - moves @ subject.identity)
     loss = np.zeros(2)
     for at in both:
         seen, basis = subject.look(rows, at)
-        skin = subject.photometric([cuts[row] for row in rows.tolist()], rows, seen, subject.blurs_px[-1])
-        skin = replace(skin, landmarks=subject.energy.select(rows), skin=mean)
+        skin = subject.photometric(
+            [cuts[row] for row in rows.tolist()], rows, seen * upper, subject.blurs_px[-1]
+        )
+        skin = replace(skin, landmarks=landmarks, skin=mean)
         energy = SubjectEnergy.at(skin, moves, basis, identity, at)
         loss += [energy.skin_loss(energy.shape(identity), where).sum() for where in both]
     seen = loss.min() > 0  # black frames look alike under whatever poses

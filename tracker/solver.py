@@ -42,6 +42,32 @@ class FrameEnergy(Protocol):
         """Gauss-Newton model at x [n, P]."""
 
 
+@dataclass(frozen=True)
+class PosesHeld:
+    """The energy of n frames whose poses stay as they are."""
+
+    energy: FrameEnergy
+
+    @property
+    def model(self) -> LandmarkModel:
+        """The head, whose modes have bounds."""
+        return self.energy.model
+
+    def select(self, frames: slice) -> PosesHeld:
+        """That of some of the frames."""
+        return PosesHeld(self.energy.select(frames))
+
+    def value(self, shape: F64, x: F64) -> F64:
+        """See `FrameEnergy`."""
+        return self.energy.value(shape, x)
+
+    def linearize(self, shape: F64, x: F64) -> Quadratic:
+        """See `FrameEnergy`."""
+        free = self.energy.linearize(shape, x)
+        pose = np.arange(x.shape[1]) >= x.shape[1] - POSE
+        return Quadratic(free.value, *freeze(free.gradient, free.hessian, np.broadcast_to(pose, x.shape)))
+
+
 Progress = Callable[[int, int], None]
 Step = tuple[F64, F64]  # of the identity [Ki] and of the frames [n, P]
 

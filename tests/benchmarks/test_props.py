@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from benchmarks.props import glasses, hair, hand, tube
+from benchmarks.props import beard, glasses, hair, hand, tube
 from tracker.head import load_head
 
 
@@ -39,6 +39,26 @@ def test_glasses_and_hand_turn_outward_and_stand_before_the_face() -> None:
         assert volume(prop.vertices, prop.faces) > 0
     eyes = head.template[head.regions["eyes"], 2].max()
     assert 0.005 < glasses(head).vertices[:, 2].max() - eyes < 0.03
-    lips = head.template[head.regions["lips"], 2].max()
-    assert hand(head, np.ones(3)).at(3.1)[:, 2].min() > lips
-    assert hand(head, np.ones(3)).at(0.0)[:, 1].max() < head.template[:, 1].min() + 0.1
+    lips, still = head.template[head.regions["lips"], 2].max(), np.zeros_like(head.template)
+    assert hand(head, np.ones(3)).at(3.1, still)[:, 2].min() > lips
+    assert hand(head, np.ones(3)).at(0.0, still)[:, 1].max() < head.template[:, 1].min() + 0.1
+
+
+def test_a_beard_grows_around_the_mouth_and_goes_along_with_it() -> None:
+    head = load_head()
+    bristles = beard(head, np.ones(3))
+    assert volume(bristles.vertices, bristles.faces) > 0
+    lips, nose = head.template[head.regions["lips"]], head.template[head.regions["face"], 2].argmax()
+    front = bristles.vertices[np.abs(bristles.vertices[:, 0]) < 0.02]
+    assert bristles.vertices[:, 1].max() < head.template[head.regions["eyes"], 1].min()
+    assert front[:, 1].max() < head.template[head.regions["face"][nose], 1]
+    over = front[(front[:, 1] < lips[:, 1].max()) & (front[:, 1] > lips[:, 1].mean())]
+    assert len(over) > 1000  # over the edge of the upper lip
+    opened = head.vertices(
+        np.zeros(len(head.identity_basis)),
+        np.eye(len(head.expression_names))[head.expression_names.index("jawOpen")],
+    )
+    moved = bristles.at(1.0, opened - head.template) - bristles.vertices
+    chin = bristles.vertices[:, 1] < lips[:, 1].min() - 0.01
+    upper = (bristles.vertices[:, 1] > lips[:, 1].max()) & (np.abs(bristles.vertices[:, 0]) < 0.015)
+    assert moved[chin, 1].mean() < -0.01 and np.abs(moved[upper, 1]).mean() < 0.003

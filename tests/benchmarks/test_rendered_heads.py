@@ -68,6 +68,16 @@ def test_fast_turn_is_fast_and_comes_back() -> None:
     assert np.abs(np.diff(angle)).max() > 5
 
 
+def test_a_head_turns_slowly_into_profile_on_either_side_and_back() -> None:
+    turned = scene_motion(replace(SCENE, seconds=8.0, head=0.0, aside_deg=70.0))
+    yaw = np.degrees(Rotation.from_rotvec(turned.rotation).as_matrix()[:, 0, 2])
+    turns = Rotation.from_rotvec(turned.rotation)
+    angle = np.degrees((turns * turns[0].inv()).magnitude())
+    assert angle.max() == pytest.approx(70, abs=0.1) and angle[-1] < 0.1
+    assert yaw.min() < -50 and yaw.max() > 50
+    assert np.abs(np.diff(angle)).max() < 5
+
+
 def test_a_cut_leaves_out_what_happens_meanwhile() -> None:
     scene = next(scene for scene in SCENES if np.isfinite(scene.shot_s))
     cut, whole = (

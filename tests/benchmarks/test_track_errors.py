@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.ground_truth import GroundTruth
 from benchmarks.track_errors import (
+    aside_deg,
     closures_invented,
     closures_reached,
     compare,
@@ -270,6 +271,22 @@ def test_bare_frames_without_a_fit_are_lost(exact: tuple[Track, GroundTruth], he
     assert errors["lost_pct"] == pytest.approx(100 * 2 / 11)
 
 
+def test_a_head_turned_aside_hides_its_lips_until_it_is_back(
+    exact: tuple[Track, GroundTruth], head: HeadModel
+) -> None:
+    track, truth = exact
+    angle = np.array([26, 29, 33, 37, 41, 44, 47, 46, 43, 39, 35, 31.0])
+    turns = (Rotation.from_euler("y", angle[:, None], degrees=True)).as_matrix() @ np.diag([1.0, -1, -1])
+    ahead = np.broadcast_to(np.array([0, 0, 0.6]), truth.translation.shape)
+    turned = replace(truth, rotation=turns, translation=ahead)
+    np.testing.assert_allclose(aside_deg(turned), angle, atol=1e-3)
+    np.testing.assert_array_equal(np.flatnonzero(disturbed(turned)), np.arange(2, 12))
+    valid, confidence = angle < 45, np.where(angle < 44, 1.0, 0.2).astype(np.float32)
+    errors = compare(replace(track, valid=valid, confidence=confidence), head, turned)
+    assert errors["lost_pct"] == 0 and errors["kept_pct"] == 0
+    assert errors["left_out_pct"] == pytest.approx(100 / 10)
+
+
 def test_fitted_frames_are_left_out_or_used_by_their_confidence(
     exact: tuple[Track, GroundTruth], head: HeadModel
 ) -> None:
@@ -287,6 +304,6 @@ def test_fitted_frames_are_left_out_or_used_by_their_confidence(
 def test_a_turn_there_and_back_is_one_disturbance(exact: tuple[Track, GroundTruth]) -> None:
     _, truth = exact
     angle = np.array([0, 0, 0, 8, 20, 30, 31, 30, 20, 8, 0, 0])[:, None]
-    turns = Rotation.from_euler("y", angle, degrees=True).as_matrix()
+    turns = Rotation.from_euler("y", angle, degrees=True).as_matrix() @ np.diag([1.0, -1, -1])
     found = disturbed(replace(truth, rotation=turns))
     np.testing.assert_array_equal(np.flatnonzero(found), np.arange(3, 11))

@@ -98,6 +98,19 @@ def test_a_turning_head_tells_focal_length_and_pose(head: HeadModel) -> None:
     assert np.median(np.abs(error)) < 0.3
 
 
+def test_what_is_seen_of_a_head_turned_far_aside_does_not_count(head: HeadModel) -> None:
+    """Whatever the patches are taken for there."""
+    marks, tracks, _ = _talk(head, 48)
+    camera, bundle = estimate_camera(marks, tracks, head)
+    observations, aside = tracks.observations.copy(), np.abs(np.sin(np.arange(40) / 40 * 2 * np.pi)) > 0.9
+    wrong = aside[observations[:, 0].astype(int)]
+    observations[wrong, 2:] += np.random.default_rng(2).normal(0, 5, (wrong.sum(), 2))
+    again, rest = estimate_camera(marks, replace(tracks, observations=observations), head)
+    assert not np.isin(np.flatnonzero(aside), rest.frame).any() and len(rest.frame) > 15
+    assert again == camera
+    np.testing.assert_array_equal(rest.rotation, bundle.rotation)
+
+
 def test_a_still_head_leaves_the_prior(head: HeadModel) -> None:
     marks, tracks, _ = _talk(head, 0.5)
     camera, bundle = estimate_camera(marks, tracks, head)

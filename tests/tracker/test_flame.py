@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from tests.flame_factory import EMBEDDED, FakeFlame
-from tracker.camera import rigid_landmarks
 from tracker.energy import Weights
 from tracker.fit import fit_track
 from tracker.flame import SurfacePoints, flame_head
 from tracker.head import HeadModel, load_head
-from tracker.landmark_indices import BLENDSHAPE_NAMES, IBUG_51, MIRRORED, POINTS, UPPER_FACE
+from tracker.landmark_indices import BLENDSHAPE_NAMES, IBUG_51, MIRRORED, POINTS, UPPER_FACE, of_rigid_face
 from tracker.modes import head_modes, movements
 from tracker.track import Camera, Landmarks, TrackError
 
@@ -171,11 +170,11 @@ def test_masks_without_bare_skin_are_refused(fake: FakeFlame) -> None:
 @pytest.mark.parametrize("landmarks", [EMBEDDED, IBUG_51])
 def test_few_landmarks_give_a_rigid_face_of_some_width(fake: FakeFlame, landmarks: tuple[int, ...]) -> None:
     sparse = flame_head("flame", arrays(fake), surface(fake, landmarks), {})
-    rigid = rigid_landmarks(sparse.landmark_embedding)
+    rigid = of_rigid_face(sparse.landmark_embedding.landmarks)
     points = sparse.landmark_positions(np.zeros(300), np.zeros(100))[rigid]
     assert len(points) >= 9 and np.linalg.svd(points - points.mean(0))[1].min() > 0.005
     full = load_head().landmark_embedding
-    assert set(full.landmarks[rigid_landmarks(full)]) == set(UPPER_FACE)
+    assert set(full.landmarks[of_rigid_face(full.landmarks)]) == set(UPPER_FACE)
 
 
 def test_the_jaws_mode_is_its_motion(head: HeadModel) -> None:

@@ -48,6 +48,14 @@ def test_one_slip_of_the_landmarker_is_no_key_frame():
     assert 200 not in chosen(talker).rows
 
 
+def test_a_head_turned_far_aside_gives_no_key_frame():
+    """What landmarks say there is worth less than what they cost. One filmed from aside throughout does."""
+    aside = Rotation.from_euler("y", np.where(np.arange(300) < 60, 50.0, 0.0)[:, None], degrees=True)
+    assert chosen(Talker(300, turn=aside)).rows.min() >= 60
+    always = Rotation.from_euler("y", np.full((300, 1), 30.0), degrees=True)
+    assert len(chosen(Talker(300, turn=always)).rows) == KEY_FRAMES
+
+
 def test_frames_that_look_alike_are_taken_once():
     talker = Talker(3, noise=0)
     points = talker.landmarks.points[[0] * 20, :, :2].astype(np.float64)

@@ -7,6 +7,7 @@ from typing import cast
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tracker.face_detector import INPUT_SIZE, Face, anchors, decode, letterbox, merge, overlaps, tiles
 from tracker.head import HeadModel, load_head
@@ -23,6 +24,7 @@ from tracker.landmarker import (
     FaceLandmarker,
     LandmarkTracker,
     Roi,
+    agreement,
     crop,
     roi_from_face,
     roi_from_points,
@@ -321,7 +323,7 @@ def test_both_readings_of_a_face_count_alike_and_depth_is_in_pixels(
     landmarker: FaceLandmarker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     random, roi = np.random.default_rng(0), Roi(300.0, 150.0, 80.0, 0.0)
-    straight, error = random.uniform(0.2, 0.8, (POINTS, 3)), 0.01 * random.normal(size=(POINTS, 3))
+    straight, error = random.uniform(0.2, 0.8, (POINTS, 3)), 0.004 * random.normal(size=(POINTS, 3))
     mirrored = (straight - error)[MIRRORED] * (-1, 1, 1) + (1, 0, 0)
 
     def reads(unit: np.ndarray, logit: float) -> object:
@@ -334,3 +336,29 @@ def test_both_readings_of_a_face_count_alike_and_depth_is_in_pixels(
     expected = 80 * (straight - (0.5, 0.5, 0)) + (300, 150, 0)
     np.testing.assert_allclose(points, expected, atol=1e-3)
     assert presence == pytest.approx(1 / (1 + np.exp(-1)))
+
+
+@pytest.mark.parametrize(
+    ("apart", "left"), [(0.0, 1.0), (0.02, 1.0), (0.03, 0.5**0.5), (0.04, 0.5), (0.1, 2.0**-4)]
+)
+def test_readings_of_one_face_that_lie_apart_are_doubted(apart: float, left: float) -> None:
+    """As a share of the face: of the longer side of its box."""
+    face = np.float32(np.random.default_rng(0).uniform(0.2, 0.6, (POINTS, 3)))
+    face[:2, :2] = (0.2, 0.1), (0.4, 0.9)
+    far = np.float32([0.8 * apart * 0.6, 0.8 * apart * 0.8, 5.0])  # depth does not count
+    assert agreement(face + far / 2, face - far / 2) == pytest.approx(left, rel=1e-3)
+
+
+def test_what_is_read_of_a_face_from_aside_is_doubted(head: HeadModel, landmarker: FaceLandmarker) -> None:
+    """There the network invents a face that its mirror image does not show, and is sure of it."""
+
+    def presence(turn_deg: float) -> float:
+        turn = Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
+        rest = head.vertices(np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_names)))
+        vertices = (rest @ turn.T @ FACING + [0, 0.02, 0.55]).astype(np.float32)
+        picture = render(vertices, head.faces, head.albedo, FOCAL, CENTRE, (SIZE, SIZE))
+        found = LandmarkTracker(landmarker).next(picture)
+        return 0.0 if found is None else found[1]
+
+    assert min(presence(turn) for turn in (-40, 0, 40)) > 0.99
+    assert max(presence(turn) for turn in (-85, -60, 60, 85)) < 0.9

@@ -257,7 +257,7 @@ def test_poses_go_all_of_the_way_to_the_turned_bundle_and_after_the_skin_half_of
     """Again where the identity is another one; not at all, or less far, where the skin says otherwise."""
     turned, held = replace(NO_BUNDLE, frame=np.arange(3, dtype=np.int32)), list[tuple[bool, float]]()
 
-    def hold(x, bundle, good, run, time, sound, share=1.0):
+    def hold(x, bundle, good, run, time, sound, middle, share=1.0):
         held.append((bundle is turned, share))
         return x + 1e-3 * share * np.eye(x.shape[1])[-1]
 

@@ -6,6 +6,7 @@ import pytest
 from tracker.energy import POSE, Quadratic, Weights
 from tracker.solver import (
     Bounds,
+    PosesHeld,
     Smoothness,
     band_step,
     bounded_step,
@@ -206,6 +207,33 @@ def test_frames_come_to_their_goals_however_far_plain_steps_lead(rng, flat: floa
     alone = Smoothness.none(FRAMES, UNKNOWNS)
     found = solve_frames(bowl, np.zeros(UNKNOWNS), np.zeros_like(goal), alone, steps=60)
     assert np.abs(found - goal).max() < 0.1
+
+
+def test_weights_come_to_their_goals_under_poses_that_are_held(rng):
+    """Where what a weight does is much like what a pose does, they go where that pose leaves them."""
+    goal, moves = rng.normal(size=(FRAMES, UNKNOWNS)), np.zeros((IDENTITIES, UNKNOWNS))
+    start = rng.normal(size=goal.shape)
+
+    class Tied(Bowl):
+        def select(self, frames: slice) -> "Bowl":
+            return Tied(self.goal[frames], self.flat, self.moves)
+
+        def value(self, shape: np.ndarray, x: np.ndarray) -> np.ndarray:
+            return super().value(shape, x) + 2 * (x[:, 0] + x[:, -1]) ** 2
+
+        def linearize(self, shape: np.ndarray, x: np.ndarray, with_identity: bool = False) -> Quadratic:
+            quadratic = super().linearize(shape, x)
+            both = np.eye(UNKNOWNS)[0] + np.eye(UNKNOWNS)[-1]
+            push = 4 * (x[:, 0] + x[:, -1])
+            hessian = quadratic.hessian + 4 * np.outer(both, both)
+            return Quadratic(self.value(shape, x), quadratic.gradient + push[:, None] * both, hessian)
+
+    bowl, alone = Tied(goal, 1.0, moves), Smoothness.none(FRAMES, UNKNOWNS)
+    found = solve_frames(PosesHeld(bowl), np.zeros(UNKNOWNS), start, alone, steps=20)
+    np.testing.assert_array_equal(found[:, WEIGHTS:], start[:, WEIGHTS:])
+    expected = goal[:, :WEIGHTS].copy()
+    expected[:, 0] = (goal[:, 0] - 4 * start[:, -1]) / 5
+    np.testing.assert_allclose(found[:, :WEIGHTS], expected, atol=0.01)
 
 
 @pytest.mark.parametrize("flat", [1.0, 0.2])
