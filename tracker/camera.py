@@ -30,7 +30,7 @@ PRIOR_SD_LOG = 0.35
 # the focal length on two telephones as they report it, 1.22 on one that was measured.
 FILM_MM = 36.0
 MIDDLE, MIDDLE_SD_LOG = 1.1, 0.12
-FOCAL_RANGE = (0.6, 5.0)  # of the long side
+FOCAL_RANGE = (0.45, 5.0)  # of the long side
 LEAST_SD_LOG = 0.08  # of log(focal): what light and skin that moves do to all tracks alike
 # Of PRIOR_SD_LOG: a clip that leaves more of it has told nothing. Beside a lens that was written down it always has its
 # say.

@@ -17,6 +17,7 @@ TOLERATED_SKIN = 3.0
 # What costs nothing, and what leaves half of the confidence.
 STRANGE, STRANGE_HALF = 0.10, 0.15  # see Appearance: bare faces stay below .12 in 99.5 % of the frames
 SHARP, SHARP_HALF = 0.70, 0.55  # of the clip's median
+CUT_OFF, CUT_OFF_HALF = 0.05, 0.125  # of the lips' landmarks: the landmarker draws those within it closer together
 FACING_DEG, FACING_HALF_DEG = (
     35.0,
     50.0,
@@ -46,18 +47,27 @@ def confidence(
 
 
 def bare(appearance: Appearance) -> F32:
-    """[T] 0..1, how far nothing seems to cover the face: the evidence that a fit's landmarks are."""
-    return _factor(appearance.strangeness, STRANGE, STRANGE_HALF).astype(np.float32)
+    """[T] 0..1, how far nothing covers the face or cuts its mouth off: the evidence that a fit's landmarks are."""
+    return (_uncovered(appearance) * _whole(appearance)).astype(np.float32)
+
+
+def _uncovered(appearance: Appearance) -> F64:
+    return _factor(appearance.strangeness, STRANGE, STRANGE_HALF)
+
+
+def _whole(appearance: Appearance) -> F64:
+    return _factor(appearance.outside, CUT_OFF, CUT_OFF_HALF)
 
 
 def judge(track: Track, appearance: Appearance, deviation: F32 | None = None) -> tuple[Track, list[str]]:
     """The track with its confidence lowered by what the pictures and the pose tell, and the main doubt of each frame.
 
     deviation: [T, 2], see `refine.Refined`; None where no skin was compared.
-    Doubts: `poor_fit`, `occluded`, `blurred`, `turned_away`; a frame's is the one that costs it the most.
+    Doubts: `poor_fit`, `occluded`, `cut_off`, `blurred`, `turned_away`; a frame's is the one that costs it the most.
     """
     factors = {
-        "occluded": bare(appearance),
+        "occluded": _uncovered(appearance),
+        "cut_off": _whole(appearance),
         "blurred": _factor(-appearance.sharpness, -SHARP, -SHARP_HALF),
         "turned_away": _factor(off_axis_deg(track), FACING_DEG, FACING_HALF_DEG),
         "poor_fit": track.confidence if deviation is None else track.confidence * _usual_skin(deviation),

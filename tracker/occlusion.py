@@ -45,10 +45,12 @@ class Appearance:
     strangeness: [T] 0..2, 1 - correlation of the region that looks least like the face's own; 0 where no face is.
     sharpness: [T] mean Laplacian of the face relative to its brightness, over the clip's median,
         1 where no face is.
+    outside: [T] share of the lips' landmarks that lie beyond the picture's edge; 0 where no face is.
     """
 
     strangeness: F32
     sharpness: F32
+    outside: F32
 
 
 class FaceWatch:
@@ -86,11 +88,13 @@ class FaceWatch:
     def appearance(self, usable: NDArray[np.bool_]) -> Appearance:
         """Of all pictures seen. usable: [T] bool, those that show the person; the others tell nothing."""
         total, detail = len(self._detail), np.array(self._detail, np.float32)
-        strangeness, sharpness = np.zeros(total, np.float32), np.ones(total, np.float32)
+        strangeness, outside = np.zeros((2, total), np.float32)
+        sharpness = np.ones(total, np.float32)
         seen = np.flatnonzero(np.isfinite(detail) & usable)
         if len(seen):
             colour, place = np.stack(self._colour)[seen], np.stack(self._place)[seen]
             inside = np.stack(self._inside)[seen]
+            outside[seen] = 1 - inside[:, list(LIPS)].mean(1)
             # Without all of the mouth a face may look as strange as it does.
             inside |= ~inside[:, list(LIPS)].all(1, keepdims=True)
             for region in regions(np.median(place, axis=0).astype(np.float64), inside.mean(0) > OFTEN):
@@ -100,7 +104,7 @@ class FaceWatch:
                 strange = _strangeness(colour[:, region], inside[:, region])
                 strangeness[seen] = np.maximum(strangeness[seen], slant * strange)
             sharpness[seen] = detail[seen] / max(float(np.median(detail[seen])), 1e-6)
-        return Appearance(strangeness, sharpness)
+        return Appearance(strangeness, sharpness, outside)
 
 
 def _detail(face: U8) -> float:

@@ -142,7 +142,7 @@ def test_what_the_camera_wrote_of_its_lens_is_the_prior(head: HeadModel) -> None
         (1.0, 0.0, 5.0, 0.08),
         (0.61, 0.1, 5.0, np.hypot(0.1, 0.08)),
         (4.9, 0.1, 5.0, np.hypot(0.1, 0.08)),
-        (0.59, 0.1, 5.0, None),  # no camera
+        (0.44, 0.1, 5.0, None),  # no camera
         (5.1, 0.1, 5.0, None),
         (1.0, 0.26, 5.0, np.hypot(0.26, 0.08)),
         (1.0, 0.28, 5.0, None),  # more than .28, beside what is never told

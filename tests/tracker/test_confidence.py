@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.personalize.test_registration import track_of
-from tracker.confidence import confidence, judge, off_axis_deg
+from tracker.confidence import bare, confidence, judge, off_axis_deg
 from tracker.head import load_head
 from tracker.occlusion import Appearance
 
@@ -23,7 +23,8 @@ def track():
 
 
 def test_nothing_against_a_frame_leaves_its_confidence(track):
-    judged, _ = judge(track, Appearance(np.full(4, 0.05, np.float32), np.ones(4, np.float32)))
+    little = np.full(4, 0.05, np.float32)
+    judged, _ = judge(track, Appearance(little, np.ones(4, np.float32), little))
     np.testing.assert_allclose(judged.confidence, track.confidence)
 
 
@@ -31,19 +32,31 @@ def test_the_doubt_is_what_costs_most(track):
     turned = track.rotation.copy()
     turned[2] = turn(60)
     poor = np.float32([1, 1, 1, 0.2])
-    appearance = Appearance(np.float32([0.6, 0, 0, 0.12]), np.float32([1, 0.3, 1, 1]))
+    appearance = Appearance(
+        np.float32([0.6, 0, 0, 0.12]), np.float32([1, 0.3, 1, 1]), np.zeros(4, np.float32)
+    )
     judged, doubts = judge(replace(track, rotation=turned, confidence=poor), appearance)
     assert doubts == ["occluded", "blurred", "turned_away", "poor_fit"]
     assert (judged.confidence < 0.5).all() and (judged.confidence <= poor).all()
 
 
 def test_a_mouth_that_looks_other_than_usual_is_a_poor_fit(track):
-    clear = Appearance(np.zeros(4, np.float32), np.ones(4, np.float32))
+    clear = Appearance(np.zeros(4, np.float32), np.ones(4, np.float32), np.zeros(4, np.float32))
     deviation = np.float32([[1, 1], [1, 5], [2.9, 2.9], [np.nan, np.nan]])
     judged, doubts = judge(track, clear, deviation)
     expected = track.confidence * np.float32([1, np.exp(-2), 1, 1])
     np.testing.assert_allclose(judged.confidence, expected, rtol=1e-6)
     assert doubts[1] == "poor_fit"
+
+
+def test_a_mouth_beyond_the_pictures_edge_is_cut_off_and_no_evidence(track):
+    cut = Appearance(
+        np.float32([0, 0, 0, 0.15]), np.ones(4, np.float32), np.float32([0.05, 0.125, 0.5, 0.125])
+    )
+    judged, doubts = judge(track, cut)
+    np.testing.assert_allclose(judged.confidence / track.confidence, [1, 0.5, 2**-6, 0.25], rtol=1e-5)
+    assert doubts[1:3] == ["cut_off", "cut_off"]
+    np.testing.assert_allclose(bare(cut), [1, 0.5, 2**-6, 0.25], rtol=1e-5)
 
 
 def turn(yaw_deg):

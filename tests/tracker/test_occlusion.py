@@ -127,6 +127,20 @@ def test_a_forehead_outside_of_the_picture_is_no_cover():
     assert seen.strangeness[covered == 0].max() < 0.08
 
 
+def test_lips_beyond_the_pictures_edge_are_told():
+    frames, landmarks = clip()
+    lips = POINTS_PX[list(LIPS), 1]
+    rows = np.where(np.arange(FRAMES) < 30, SIDE, int(np.median(lips)))
+    still = [(time, frames[0][1][:low]) for (time, _), low in zip(frames, rows)]
+    landmarks.points[..., :2] = POINTS_PX
+    landmarks.points[40:50] = np.nan
+    seen = look(still, landmarks)
+    expected = np.where(rows < SIDE, (lips > rows[-1] - 1).mean(), 0)
+    expected[40:50] = 0
+    assert 0.3 < expected.max() < 0.9
+    np.testing.assert_allclose(seen.outside, expected)
+
+
 def test_light_that_comes_from_elsewhere_little_by_little_is_no_cover():
     across = np.linspace(-1, 1, SIDE)[None, :, None]
 
