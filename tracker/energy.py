@@ -60,7 +60,9 @@ class Weights:
     expression_mean: float = 0.5
     """Mean of the exponential prior on an expression weight."""
     ambiguous_mean: float = 0.02
-    """The same for shapes that trade depth or side shift against pose, or that landmarks cannot see."""
+    """The same for shapes that trade depth against pose, or that landmarks cannot see."""
+    aside_mean: float = 0.1
+    """The same for shapes that trade a shift to the side against pose."""
     expression_sd: float = 0.5
     """Standard deviation of the Gaussian prior on an expression weight."""
     lip_shape_sd: float = 0.6

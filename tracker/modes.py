@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 JAW_STEP, WIDEST_JAW = 0.2, 0.7  # rad
 # A lip up by two or three half waves from corner to corner, 5 mm at weight 1.
 LIP_SHAPES = ("lipUpper2", "lipUpper3", "lipLower2", "lipLower3")
-# Shapes that trade depth or side shift against pose, or that landmarks cannot see.
-AMBIGUOUS = ("jawForward", "jawLeft", "jawRight", "mouthLeft", "mouthRight", "tongueOut", "cheekPuff")
+# Shapes that trade depth against pose or that landmarks cannot see, and those that trade a shift to the side, which
+# a mouth pulled awry does show.
+AMBIGUOUS, ASIDE = ("jawForward", "tongueOut", "cheekPuff"), ("jawLeft", "jawRight", "mouthLeft", "mouthRight")
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ def _arkit_modes(head: HeadModel, weights: Weights) -> Modes:
     count = len(names)
     to_head = np.eye(count, count + 3)
     to_head[names.index("mouthClose"), names.index("jawOpen")] = 1.0
-    mean = np.array([weights.ambiguous_mean if n in AMBIGUOUS else weights.expression_mean for n in names])
+    mean = np.full(count, weights.expression_mean)
+    mean[np.isin(names, AMBIGUOUS)], mean[np.isin(names, ASIDE)] = weights.ambiguous_mean, weights.aside_mean
     profile = np.isin(names, LIP_SHAPES)
     rate = np.where(profile, 0.0, 1.0 / mean)
     precision = np.where(profile, weights.lip_shape_sd, weights.expression_sd) ** -2.0

@@ -236,7 +236,8 @@ def test_each_shape_has_its_bounds_and_its_prior():
         return tuple(float(values[k]) for values in (modes.lower, modes.upper, modes.rate, modes.precision))
 
     assert of("jawOpen") == of("eyeBlinkLeft") == of("mouthClose") == (0, 1, 2, 4)
-    assert of("jawForward") == of("mouthLeft") == of("cheekPuff") == (0, 1, 50, 4)
+    assert of("jawForward") == of("cheekPuff") == of("tongueOut") == (0, 1, 50, 4)
+    assert of("mouthLeft") == of("jawRight") == (0, 1, 10, 4)
     assert of("lipUpper2") == of("lipLower3") == (-1, 1, 0, pytest.approx(0.6**-2))
     # A shut mouth under an open jaw: mouthClose never exceeds jawOpen.
     expression, _ = modes.head_weights(np.eye(len(modes))[names.index("mouthClose")])

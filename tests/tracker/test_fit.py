@@ -243,6 +243,18 @@ def test_a_mouth_that_opens_in_another_profile_is_followed(monkeypatch):
     assert followed < 0.5 * held
 
 
+@pytest.mark.parametrize("shape", ["mouthLeft", "mouthRight", "jawLeft"])
+def test_a_mouth_pulled_awry_is_followed(shape: str):
+    """And none is invented of a mouth that only opens, as the head turns."""
+    awry = slice(40, 60)
+    talker = Talker(100, held=(awry, {shape: 0.6, "jawOpen": 0.15}))
+    moves = HEAD.expression_basis[:, HEAD.regions["lips"], 0].mean(1)
+    found, true = (1e3 * (weights @ moves) for weights in (talker.fit().expression, talker.expression))
+    assert abs(true[awry].mean()) > 1.5
+    assert found[awry].mean() == pytest.approx(true[awry].mean(), rel=0.2)
+    assert np.abs((found - true)[:35]).mean() < 0.25
+
+
 def test_a_frame_in_which_the_landmarker_hardly_sees_a_face_is_not_measured():
     talker = Talker(4)
     presence = np.float32([1, 0.49, 0.5, 1])
