@@ -24,7 +24,10 @@ JAW_STEP, WIDEST_JAW = 0.2, 0.7  # rad
 LIP_SHAPES = ("lipUpper2", "lipUpper3", "lipLower2", "lipLower3")
 # Shapes that trade depth against pose or that landmarks cannot see, and those that trade a shift to the side, which
 # a mouth pulled awry does show.
-AMBIGUOUS, ASIDE = ("jawForward", "tongueOut", "cheekPuff"), ("jawLeft", "jawRight", "mouthLeft", "mouthRight")
+AMBIGUOUS, ASIDE = (
+    ("jawForward", "tongueOut", "cheekPuff"),
+    ("jawLeft", "jawRight", "mouthLeft", "mouthRight"),
+)
 
 
 @dataclass(frozen=True)
