@@ -19,10 +19,10 @@ r, rmse, about  lip opening: correlation, RMSE, RMSE about its mean, mm
 rot, focal      head rotation without the constant, degrees; focal length, %
 jitter, still   second difference of the lips' error; face vertices' rms on a clip where nothing moves, mm
 close, false    share of the lips' closures reached within one frame; of the fitted ones, upon open lips
-auc             how often a covered frame has less confidence than a clear one
-back            frames until the fit recovers from a hand or a fast turn
+auc             how often a frame whose lips are hidden, behind a hand or in profile, has less confidence than others
+back            frames until the fit recovers from a hand, a fast turn or a turn aside
 lost            share of the frames with bare lips that have no fit, and so count in no error but `back`, %
-out, kept       share of those that have a fit which is left out by default; of the covered frames that are used, %
+out, kept       share of those that have a fit which is left out by default; of the hidden ones that are used, %
 ms, cpu         time a frame of all stages up to here, from the search for usable frames on: on the clock,
                 and of all processors
 """

@@ -17,10 +17,8 @@ TOLERATED_SKIN = 3.0
 # What costs nothing, and what leaves half of the confidence.
 STRANGE, STRANGE_HALF = 0.10, 0.15  # see Appearance: bare faces stay below .12 in 99.5 % of the frames
 SHARP, SHARP_HALF = 0.70, 0.55  # of the clip's median
-CUT_OFF, CUT_OFF_HALF = (
-    0.05,
-    0.125,
-)  # of the lips' landmarks: the landmarker draws those within it closer together
+# Of the lips' landmarks beyond the picture's edge; the landmarker draws those within it closer together.
+CUT_OFF, CUT_OFF_HALF = 0.05, 0.125
 FACING_DEG, FACING_HALF_DEG = (
     35.0,
     50.0,

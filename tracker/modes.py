@@ -22,12 +22,10 @@ if TYPE_CHECKING:
 JAW_STEP, WIDEST_JAW = 0.2, 0.7  # rad
 # A lip up by two or three half waves from corner to corner, 5 mm at weight 1.
 LIP_SHAPES = ("lipUpper2", "lipUpper3", "lipLower2", "lipLower3")
-# Shapes that trade depth against pose or that landmarks cannot see, and those that trade a shift to the side, which
-# a mouth pulled awry does show.
-AMBIGUOUS, ASIDE = (
-    ("jawForward", "tongueOut", "cheekPuff"),
-    ("jawLeft", "jawRight", "mouthLeft", "mouthRight"),
-)
+# Shapes that trade depth against pose, or that landmarks cannot see.
+AMBIGUOUS = ("jawForward", "tongueOut", "cheekPuff")
+# Those that trade a shift to the side against pose, which a mouth pulled awry does show.
+ASIDE = ("jawLeft", "jawRight", "mouthLeft", "mouthRight")
 
 
 @dataclass(frozen=True)
