@@ -26,6 +26,17 @@ FACE_DEPTH_M = 0.085  # of the face before the head's origin
 # When the head turns, when it turns back, and how long each takes, s: fast, and slowly aside to the left and right.
 FAST_TURN = (2.5, 2.74, 0.2)
 ASIDE_TURNS = ((1.0, 2.6, 1.0), (4.4, 6.0, 1.0))
+_SMILE = ("mouthSmileLeft", "mouthSmileRight", "cheekSquintLeft", "cheekSquintRight")
+_SURPRISE = ("browInnerUp", "browOuterUpLeft", "browOuterUpRight")
+_FROWN = ("browDownLeft", "browDownRight", "noseSneerLeft", "noseSneerRight")
+# Shapes, by how much, and when: begun, gone again, and how long each takes, s.
+MOODS = (
+    (_SMILE, 0.6, (0.6, 1.6, 0.35)),
+    (_SURPRISE, 0.7, (1.9, 2.6, 0.35)),
+    (_FROWN, 0.6, (3.0, 3.8, 0.35)),
+    (("mouthLeft",), 0.5, (2.9, 3.6, 0.3)),
+    (_SMILE[:2], 0.4, (4.3, 5.4, 0.35)),
+)
 CUT_S = 2.0  # that are missing at a cut
 LIP_ROLL = 0.4  # of the demo's: lower lips on real film hardly roll in, not at /f v/ either
 Colour = tuple[float, float, float]
@@ -56,6 +67,8 @@ class Scene:
     speaks: bool = True
     """False: nothing moves."""
     speech_start_s: float = 0.0
+    moods: bool = False
+    """Smiles, is surprised, frowns and pulls the mouth awry meanwhile."""
     skin: Colour = (1.0, 1.0, 1.0)
     """Factors of the painted albedo."""
     hair: Colour = (0.16, 0.11, 0.08)
@@ -149,6 +162,15 @@ SCENES = (
         skin=(0.90, 0.84, 0.80),
         key_light=(-30.0, 30.0),
     ),
+    Scene(
+        *("moods", 25),
+        focal=1.25,
+        head=0.8,
+        speech_start_s=18.0,
+        moods=True,
+        skin=(0.82, 0.75, 0.70),
+        key_light=(20.0, 30.0),
+    ),
     # A phone at arm's length: the face is 560 px wide.
     Scene(
         *("selfie", 19),
@@ -235,6 +257,11 @@ def scene_motion(scene: Scene) -> TalkerMotion:
     motion = _cut(motion, scene.shot_s)
     rolled = motion.expression.copy()
     rolled[:, motion.names.index("mouthRollLower")] *= LIP_ROLL
+    if scene.moods:
+        for names, weight, when in MOODS:
+            for name in names:
+                shape = rolled[:, motion.names.index(name)]
+                shape += weight * (1 - shape) * _there_and_back(len(rolled), when)
     motion = replace(motion, expression=rolled)
     if not scene.speaks:
         motion = replace(

@@ -78,6 +78,16 @@ def test_a_head_turns_slowly_into_profile_on_either_side_and_back() -> None:
     assert np.abs(np.diff(angle)).max() < 5
 
 
+def test_moods_come_and_go_and_leave_the_speech() -> None:
+    moody = scene_motion(replace(SCENE, seconds=6.0, moods=True))
+    even = scene_motion(replace(SCENE, seconds=6.0))
+    apart = moody.expression - even.expression
+    for name, second in (("mouthSmileLeft", 1.2), ("browInnerUp", 2.4), ("mouthLeft", 3.4)):
+        column = apart[:, even.names.index(name)]
+        assert column[round(second * FPS)] > 0.3 and column[0] == column[-1] == 0
+    assert moody.expression.max() <= 1 and not apart[:, even.names.index("jawOpen")].any()
+
+
 def test_a_cut_leaves_out_what_happens_meanwhile() -> None:
     scene = next(scene for scene in SCENES if np.isfinite(scene.shot_s))
     cut, whole = (
