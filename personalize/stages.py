@@ -198,7 +198,7 @@ class ReadTracked(Stage):
 class Judge(Stage):
     """The refined track with its confidence lowered by what the pictures tell, and which frames are used."""
 
-    name, folder, version, reads = "judge", "refine", 1, ("min_confidence",)
+    name, folder, version, reads = "judge", "refine", 2, ("min_confidence",)
     needs = (
         *("ingest/frames.npz", "landmarks/appearance.npz"),
         *("photometric/track.npz", "photometric/deviation.npz"),

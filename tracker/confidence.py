@@ -24,6 +24,8 @@ FACING_DEG, FACING_HALF_DEG = (
     50.0,
 )  # of the face's axis from the line of sight; landmarks are lost near 60
 
+EXPLAINS = 0.75  # a doubt that leaves so little is named before a poor fit, which comes of it
+
 
 def confidence(
     error: F64, visible: F64, presence: NDArray[np.floating], good: NDArray[np.int64], total: int
@@ -64,7 +66,8 @@ def judge(track: Track, appearance: Appearance, deviation: F32 | None = None) ->
     """The track with its confidence lowered by what the pictures and the pose tell, and the main doubt of each frame.
 
     deviation: [T, 2], see `refine.Refined`; None where no skin was compared.
-    Doubts: `poor_fit`, `occluded`, `cut_off`, `blurred`, `turned_away`; a frame's is the one that costs it the most.
+    Doubts: `occluded`, `cut_off`, `blurred`, `turned_away`; a frame's is the one that costs it the most, or, where none
+    costs much, `poor_fit`.
     """
     factors = {
         "occluded": _uncovered(appearance),
@@ -74,7 +77,9 @@ def judge(track: Track, appearance: Appearance, deviation: F32 | None = None) ->
         "poor_fit": track.confidence if deviation is None else track.confidence * _usual_skin(deviation),
     }
     each = np.stack([np.asarray(values, np.float32) for values in factors.values()])
-    doubts = [tuple(factors)[index] for index in each.argmin(0)]
+    explained = each[:-1].min(0) < EXPLAINS
+    main = np.where(explained, each[:-1].argmin(0), each.argmin(0))
+    doubts = [tuple(factors)[index] for index in main]
     return replace(track, confidence=each.prod(0)), doubts
 
 

@@ -40,6 +40,17 @@ def test_the_doubt_is_what_costs_most(track):
     assert (judged.confidence < 0.5).all() and (judged.confidence <= poor).all()
 
 
+def test_a_poor_fit_is_told_by_what_it_comes_of(track):
+    """A face in profile lies badly, and that it is turned away says why; one turned by a little does not."""
+    turned = track.rotation.copy()
+    turned[:3] = turn(42), turn(60), turn(36)
+    nothing = np.zeros(4, np.float32)
+    clear = Appearance(nothing, np.ones(4, np.float32), nothing)
+    poor = np.float32([0.01, 0.01, 0.01, 1])
+    _, doubts = judge(replace(track, rotation=turned, confidence=poor), clear)
+    assert doubts[:3] == ["turned_away", "turned_away", "poor_fit"]
+
+
 def test_a_mouth_that_looks_other_than_usual_is_a_poor_fit(track):
     clear = Appearance(np.zeros(4, np.float32), np.ones(4, np.float32), np.zeros(4, np.float32))
     deviation = np.float32([[1, 1], [1, 5], [2.9, 2.9], [np.nan, np.nan]])
