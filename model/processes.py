@@ -25,5 +25,6 @@ def joined(device: str) -> Iterator[tuple[int, str]]:
     distributed.init_process_group("nccl" if device.startswith("cuda") else "gloo")
     try:
         yield distributed.get_rank(), device
+        distributed.barrier()  # nobody leaves while another may still hear from it
     finally:
         distributed.destroy_process_group()
