@@ -37,8 +37,8 @@ INPUT_SIZE = 256  # px, side of the landmark network's square input
 MARGIN = 1.5  # side of the region over the long side of the face's box
 MIN_PRESENCE = 0.5  # below, the face counts as lost
 # How far a crop and its mirror image may be read apart, as a share of the face, and what halves the presence. Faces
-# that are seen at all are below .02 but for a hand on them (.03); in profile, on which one network alone invents a
-# face, .05 to .26 are usual.
+# that are seen are below .02 but behind a hand (.03) and half out of the picture (.04); in profile, where the network
+# invents faces, .05 to .26 are usual.
 APART, APART_HALF = 0.02, 0.04
 SEARCH_INTERVAL = 10  # frames between searches in tiles while no face is found: each is dozens of detections
 # Share of the new frame's region in the smoothed one, STEP_S after the last. A region that jumps adds jitter, one that
