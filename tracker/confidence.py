@@ -24,7 +24,7 @@ FACING_DEG, FACING_HALF_DEG = (
     50.0,
 )  # of the face's axis from the line of sight; landmarks are lost near 60
 
-EXPLAINS = 0.75  # a doubt that leaves so little is named before a poor fit, which comes of it
+TURNED = 0.75  # what is left by a turn that is named whatever else is amiss: at 41 degrees
 
 
 def confidence(
@@ -66,8 +66,8 @@ def judge(track: Track, appearance: Appearance, deviation: F32 | None = None) ->
     """The track with its confidence lowered by what the pictures and the pose tell, and the main doubt of each frame.
 
     deviation: [T, 2], see `refine.Refined`; None where no skin was compared.
-    Doubts: `occluded`, `cut_off`, `blurred`, `turned_away`; a frame's is the one that costs it the most, or, where none
-    costs much, `poor_fit`.
+    Doubts: `poor_fit`, `occluded`, `cut_off`, `blurred`, `turned_away`; a frame's is the one that costs it the most, but
+    for a face turned away, which looks strange and fits badly for that.
     """
     factors = {
         "occluded": _uncovered(appearance),
@@ -77,9 +77,10 @@ def judge(track: Track, appearance: Appearance, deviation: F32 | None = None) ->
         "poor_fit": track.confidence if deviation is None else track.confidence * _usual_skin(deviation),
     }
     each = np.stack([np.asarray(values, np.float32) for values in factors.values()])
-    explained = each[:-1].min(0) < EXPLAINS
-    main = np.where(explained, each[:-1].argmin(0), each.argmin(0))
-    doubts = [tuple(factors)[index] for index in main]
+    turned = factors["turned_away"] < TURNED
+    doubts = [
+        "turned_away" if aside else tuple(factors)[index] for aside, index in zip(turned, each.argmin(0))
+    ]
     return replace(track, confidence=each.prod(0)), doubts
 
 
