@@ -23,7 +23,6 @@ FACING_DEG, FACING_HALF_DEG = (
     35.0,
     50.0,
 )  # of the face's axis from the line of sight; landmarks are lost near 60
-
 TURNED = 0.75  # what is left by a turn that is named whatever else is amiss: at 41 degrees
 
 
@@ -66,8 +65,8 @@ def judge(track: Track, appearance: Appearance, deviation: F32 | None = None) ->
     """The track with its confidence lowered by what the pictures and the pose tell, and the main doubt of each frame.
 
     deviation: [T, 2], see `refine.Refined`; None where no skin was compared.
-    Doubts: `poor_fit`, `occluded`, `cut_off`, `blurred`, `turned_away`; a frame's is the one that costs it the most, but
-    for a face turned away, which looks strange and fits badly for that.
+    Doubts: `poor_fit`, `occluded`, `cut_off`, `blurred`, `turned_away`; a frame's is the one that costs it the most,
+    but for a face turned away, which looks strange and fits badly for that.
     """
     factors = {
         "occluded": _uncovered(appearance),
