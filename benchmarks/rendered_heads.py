@@ -62,6 +62,8 @@ class Scene:
     fast_turn_deg: float = 0.0
     aside_deg: float = 0.0
     """How far the head turns slowly to either side."""
+    camera_deg: tuple[float, float] = (0.0, 0.0)
+    """How far to the subject's left, and how far above, the camera stands all the time."""
     shot_s: float = np.inf
     """After so long there is a cut: CUT_S of what happens are not filmed."""
     speaks: bool = True
@@ -171,6 +173,36 @@ SCENES = (
         skin=(0.82, 0.75, 0.70),
         key_light=(20.0, 30.0),
     ),
+    # By the camera of a laptop on a table, from beside the camera, and by a phone that is held high.
+    Scene(
+        *("laptop", 26),
+        size=(1280, 720),
+        focal=0.8,
+        head=0.7,
+        camera_deg=(4.0, -20.0),
+        speech_start_s=14.0,
+        skin=(0.98, 0.94, 0.90),
+        key_light=(10.0, 45.0),
+    ),
+    Scene(
+        *("interview", 27),
+        focal=1.8,
+        head=0.7,
+        camera_deg=(30.0, 3.0),
+        speech_start_s=22.0,
+        skin=(0.88, 0.81, 0.76),
+        key_light=(45.0, 30.0),
+    ),
+    Scene(
+        *("high", 28),
+        size=(720, 1280),
+        focal=0.85,
+        head=0.7,
+        camera_deg=(-6.0, 18.0),
+        speech_start_s=33.0,
+        skin=(0.80, 0.72, 0.66),
+        key_light=(-25.0, 40.0),
+    ),
     # A phone at arm's length: the face is 560 px wide.
     Scene(
         *("selfie", 19),
@@ -273,7 +305,12 @@ def scene_motion(scene: Scene) -> TalkerMotion:
         )
     left, right = (_there_and_back(len(motion.expression), turn) for turn in ASIDE_TURNS)
     fast = _there_and_back(len(motion.expression), FAST_TURN)
-    return _turned(motion, np.radians(scene.fast_turn_deg * fast + scene.aside_deg * (left - right)))
+    yaw = np.radians(scene.fast_turn_deg * fast + scene.aside_deg * (left - right))
+    motion = _turned(motion, Rotation.from_euler("y", yaw[:, None]), NECK)
+    # Seen from elsewhere, the face stays in the picture's middle.
+    aside, above = scene.camera_deg
+    seen_from = Rotation.from_euler("yx", [-aside, above], degrees=True)
+    return _turned(motion, seen_from, np.array([0.0, 0.0, FACE_DEPTH_M]))
 
 
 def _phones(start: float) -> list[Phone]:
@@ -295,9 +332,9 @@ def _there_and_back(frames: int, turn: tuple[float, float, float]) -> F64:
     return 0.5 * (np.cos(np.pi * back) - np.cos(np.pi * there))
 
 
-def _turned(motion: TalkerMotion, yaw: F64) -> TalkerMotion:
-    """The head turned further about the neck by yaw [T] rad."""
+def _turned(motion: TalkerMotion, turn: Rotation, about: F64) -> TalkerMotion:
+    """The head turned further, about a point [3] m of its own frame."""
     first = Rotation.from_rotvec(motion.rotation)
-    then = first * Rotation.from_euler("y", yaw[:, None])
-    moved = motion.translation + first.apply(NECK) - then.apply(NECK)
+    then = first * turn
+    moved = motion.translation + first.apply(about) - then.apply(about)
     return replace(motion, rotation=then.as_rotvec().astype(np.float32), translation=moved.astype(np.float32))

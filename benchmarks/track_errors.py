@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from kornia.geometry import axis_angle_to_rotation_matrix
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, minimum_filter1d
+from scipy.ndimage import binary_closing, binary_propagation, minimum_filter1d
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 from scipy.spatial import cKDTree
@@ -230,10 +230,12 @@ def aside_deg(truth: GroundTruth) -> F64:
 
 
 def disturbed(truth: GroundTruth) -> Bool:
-    """[T] frames in which the lips are covered, the head turns fast, or is turned aside."""
+    """[T] frames in which the lips are covered, the head turns fast, or is turned aside until it is turned back."""
     step = truth.rotation[1:] @ truth.rotation[:-1].transpose(0, 2, 1)
     fast = np.concatenate([[False], _angle_deg(step) > FAST_DEG])
-    seen = fast | (truth.covered > COVERED) | (aside_deg(truth) > NEAR_DEG)
+    aside = aside_deg(truth)
+    gone = binary_propagation(aside > ASIDE_DEG, mask=aside > NEAR_DEG)
+    seen = fast | (truth.covered > COVERED) | gone
     return seen | binary_closing(seen, iterations=2)  # a turn's far end belongs to it
 
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from personalize.files import write_text
 from personalize.shots import Frames
+from tracker.confidence import from_above_deg
 from tracker.refine import Refined
 from tracker.track import F32, Track
 
@@ -25,6 +26,8 @@ COLUMNS = (
 LIKE_LIPS = 0.2
 # See tracker.lip_lines: sharp clips have .13 and more, a face of 50 px between the eyes .09, blurred ones .07 to .08.
 FINE = 0.083
+# Of the camera, in the median frame: from 18 degrees on openings come out a fifth too narrow.
+FROM_ABOVE_DEG = 13.0
 FACING_CAMERA = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
@@ -74,6 +77,13 @@ def lip_warnings(refined: Refined) -> list[str]:
         texts.append(
             "the face is out of focus, or its details are lost otherwise: openings may be measured one or two "
             "millimetres too wide; focus on the face, clean the lens, film closer"
+        )
+    seen = refined.track.valid
+    above = float(np.median(from_above_deg(refined.track)[seen])) if seen.any() else 0.0
+    if above > FROM_ABOVE_DEG and np.isfinite(refined.fineness):
+        texts.append(
+            f"the face is filmed from above, by some {above:.0f} degrees: openings may be measured a tenth to a third "
+            "too narrow; film from the height of the eyes or from below"
         )
     return texts
 

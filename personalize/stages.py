@@ -71,7 +71,7 @@ class Ingest(Stage):
 class LandmarkStage(Stage):
     """478 points and 52 scores on every frame that shows the face, what covers or blurs it, and rigid features."""
 
-    name, version = "landmarks", 9
+    name, version = "landmarks", 10
     needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz", "features.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -198,7 +198,7 @@ class ReadTracked(Stage):
 class Judge(Stage):
     """The refined track with its confidence lowered by what the pictures tell, and which frames are used."""
 
-    name, folder, version, reads = "judge", "refine", 2, ("min_confidence",)
+    name, folder, version, reads = "judge", "refine", 3, ("min_confidence",)
     needs = (
         *("ingest/frames.npz", "landmarks/appearance.npz"),
         *("photometric/track.npz", "photometric/deviation.npz"),

@@ -23,6 +23,8 @@ FACING_DEG, FACING_HALF_DEG = (
     35.0,
     50.0,
 )  # of the face's axis from the line of sight; landmarks are lost near 60
+# What a degree counts from above: a jaw that opens moves back as well as down, which looks like less from there.
+FROM_ABOVE = 2.0
 TURNED = 0.75  # what is left by a turn that is named whatever else is amiss: at 41 degrees
 
 
@@ -95,7 +97,18 @@ def _factor(value: NDArray[np.floating], free: float, half: float) -> F64:
 
 
 def off_axis_deg(track: Track) -> F64:
-    """[T] angle between the face's axis and the line from the head to the camera, degrees."""
-    axes = (Rotation.from_rotvec(track.rotation) * Rotation.from_rotvec(track.neck)).as_matrix()[:, :, 2]
-    sight = -track.translation / np.linalg.norm(track.translation, axis=1, keepdims=True)
-    return np.degrees(np.arccos(np.clip((axes * sight).sum(1), -1.0, 1.0)))
+    """[T] angle between the face's axis and the line from the head to the camera, degrees; more of it from above."""
+    x, y, z = _towards_camera(track).T
+    above = np.maximum(y, 0.0) / np.maximum(np.hypot(x, y), 1e-9)
+    return np.degrees(np.arccos(np.clip(z, -1.0, 1.0))) * np.sqrt(1.0 + (FROM_ABOVE**2 - 1.0) * above**2)
+
+
+def from_above_deg(track: Track) -> F64:
+    """[T] degrees by which the camera stands above the plane of the head's nose and ears; less than 0 below it."""
+    return np.degrees(np.arcsin(np.clip(_towards_camera(track)[:, 1], -1.0, 1.0)))
+
+
+def _towards_camera(track: Track) -> F64:
+    """[T, 3] unit, head axes: from the head to the camera."""
+    head = Rotation.from_rotvec(track.rotation) * Rotation.from_rotvec(track.neck)
+    return head.inv().apply(-track.translation / np.linalg.norm(track.translation, axis=1, keepdims=True))

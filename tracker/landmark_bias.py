@@ -2,8 +2,9 @@
 
 The network draws each face towards the usual one: nods come out a seventh to a quarter too small, whoever nods. So what
 its points err by goes with what they show. How, was learned from pictures of people drawn by lot whose truth is known
-(tools/build_landmark_bias.py), as a linear map. Only what changes within a clip is put right: what a person's points
-err by throughout is part of where they lie on a head.
+(tools/build_landmark_bias.py), as a linear map. Of a face filmed from the front only what changes within a clip is put
+right: what a person's points err by throughout is part of where they lie on a head. One filmed from aside, from above
+or from below all the time errs by more than that.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ ASSET = Path(__file__).parent / "assets" / "landmark_bias.npz"
 # What was not seen when the map was learned errs as the farthest that was.
 FARTHEST_TURN = (0.45, 0.3)  # rad, yaw and nod
 FARTHEST_SCORE = 3.0  # standard deviations
+# rad: by what lies beyond, a face that is usually turned farther than this errs throughout.
+USUAL_TURN = 0.1
 # What two lips or lids err by apart from each other counts in full from this opening on, and the less the narrower it
 # is read: not at all where they touch, so that shut ones stay as far apart as the clip's others.
 OPEN_M = 0.004
@@ -73,7 +76,7 @@ class LandmarkBias:
         """The points [n, 478, 3] px of a clip, NaN where there is no face, less what they err by.
 
         usable: [n], frames of the person meant. What their points err by when the face is as it usually is in them
-        (the median) stays.
+        (the median), but faces the camera to within USUAL_TURN, stays.
         """
         out = points.copy()
         known = np.flatnonzero(np.ptp(points[:, self.landmarks, :2], axis=1).min(axis=1) > 0)
@@ -82,6 +85,7 @@ class LandmarkBias:
         parts = np.array_split(known, range(TOGETHER, len(known), TOGETHER))
         looks = [self.features(points[rows]) for rows in parts]
         usual = np.median(np.concatenate([look[0] for look in looks])[usable[known]], axis=0)
+        usual[:2] = np.clip(usual[:2], -USUAL_TURN, USUAL_TURN)
         farthest = np.array([*FARTHEST_TURN, *[FARTHEST_SCORE] * len(self.modes)])
         for rows, (features, scale, axes) in zip(parts, looks):
             departure = np.clip(features - usual, -farthest, farthest)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.rendered_heads import CUT_S, FPS, SCENES, Scene, scene_motion, stranger
+from benchmarks.rendered_heads import CUT_S, FACE_DEPTH_M, FPS, SCENES, Scene, scene_motion, stranger
 from tracker.head import HeadModel, load_head
 
 SCENE = Scene("any", 3, seconds=2.0)
@@ -76,6 +76,27 @@ def test_a_head_turns_slowly_into_profile_on_either_side_and_back() -> None:
     assert angle.max() == pytest.approx(70, abs=0.1) and angle[-1] < 0.1
     assert yaw.min() < -50 and yaw.max() > 50
     assert np.abs(np.diff(angle)).max() < 5
+
+
+@pytest.mark.parametrize(("aside", "above"), [(30.0, 0.0), (-8.0, 0.0), (0.0, 18.0), (0.0, -20.0)])
+def test_a_camera_elsewhere_sees_the_face_from_there_in_the_pictures_middle(
+    aside: float, above: float
+) -> None:
+    still, face = replace(SCENE, head=0.0), np.array([0, 0, FACE_DEPTH_M])
+    ahead, elsewhere = scene_motion(still), scene_motion(replace(still, camera_deg=(aside, above)))
+    (turns, there), (turned, still_there) = (
+        (turn, turn.apply(face) + motion.translation)
+        for motion in (ahead, elsewhere)
+        for turn in [Rotation.from_rotvec(motion.rotation)]
+    )
+    np.testing.assert_allclose(still_there, there, atol=1e-6)
+    before, after = turns.inv().apply(-there), turned.inv().apply(-there)
+    if not above:
+        moved = np.arctan2(after[:, 0], after[:, 2]) - np.arctan2(before[:, 0], before[:, 2])
+        np.testing.assert_allclose(np.degrees(moved), aside, atol=0.5)
+    if not aside:
+        moved = np.arctan2(after[:, 1], after[:, 2]) - np.arctan2(before[:, 1], before[:, 2])
+        np.testing.assert_allclose(np.degrees(moved), above, atol=0.5)
 
 
 def test_moods_come_and_go_and_leave_the_speech() -> None:

@@ -11,7 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from personalize.evaluation.report import _apart
 from personalize.pipeline import STAGES
-from personalize.quality import frame_reasons, head_angles, left_out, read_reasons, write_quality
+from personalize.quality import (
+    frame_reasons,
+    head_angles,
+    left_out,
+    lip_warnings,
+    read_reasons,
+    write_quality,
+)
 from personalize.run import write_refined
 from personalize.shots import REASONS, Frames
 from personalize.stages import Refine
@@ -83,6 +90,19 @@ def test_how_badly_lips_are_seen_is_told_when_made_and_when_cached(
     context = MagicMock()
     Refine().make(context, tmp_path / "photometric")
     assert [call.args[0] for call in context.report.warn.call_args_list] == texts
+
+
+@pytest.mark.parametrize(
+    ("nod", "fineness", "warned"), [(9, 0.2, 0), (20, 0.2, 1), (20, np.nan, 0), (-30, 0.2, 0)]
+)
+def test_a_face_filmed_from_above_is_told(track, nod: float, fineness: float, warned: int):
+    """Of frames that were fitted; openings that another tracker read are its own."""
+    bowed = (Rotation.from_euler("x", nod, degrees=True) * FACING).as_rotvec()
+    upright = FACING.as_rotvec()
+    rotation = np.float32([upright, upright, bowed, bowed, bowed, upright])
+    seen = replace(track, rotation=rotation, translation=np.tile(np.float32([0, 0, 0.6]), (6, 1)))
+    texts = lip_warnings(Refined(seen, np.ones((6, 2), np.float32), 0.1, fineness))
+    assert len(texts) == warned and all(f"from above, by some {nod} degrees" in text for text in texts)
 
 
 def test_spans_end_where_the_next_frame_begins():

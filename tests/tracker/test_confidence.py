@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.personalize.test_registration import track_of
-from tracker.confidence import bare, confidence, judge, off_axis_deg
+from tracker.confidence import FROM_ABOVE, bare, confidence, from_above_deg, judge, off_axis_deg
 from tracker.head import load_head
 from tracker.occlusion import Appearance
 
@@ -80,6 +80,22 @@ def test_the_angle_to_the_line_of_sight(track, yaw):
     assert off_axis_deg(replace(track, rotation=np.tile(turn(yaw), (4, 1)))) == pytest.approx(
         abs(yaw), abs=0.05
     )
+
+
+@pytest.mark.parametrize("nod", [0, 20, -35, 44])
+@pytest.mark.parametrize("yaw", [0, -30])
+def test_what_is_seen_from_above_counts_more_than_from_below_or_aside(track, yaw, nod):
+    """A head that is turned, then bowed by `nod` degrees before a camera straight ahead of it."""
+    turned = Rotation.from_euler("x", nod, degrees=True) * Rotation.from_rotvec(turn(yaw))
+    bowed = replace(track, rotation=np.tile(turned.as_rotvec().astype(np.float32), (4, 1)))
+    towards = turned.inv().apply([0, 0, -1])
+    above = np.degrees(np.arcsin(towards[1]))
+    np.testing.assert_allclose(from_above_deg(bowed), above, atol=1e-3)
+    assert np.sign(round(above)) == np.sign(nod) and (yaw or above == pytest.approx(nod, abs=1e-3))
+    angle = np.degrees(np.arccos(towards[2]))
+    up = angle * max(towards[1], 0) / max(np.hypot(*towards[:2]), 1e-9)
+    aside = np.sqrt(angle**2 - up**2)
+    assert off_axis_deg(bowed) == pytest.approx(np.hypot(aside, FROM_ABOVE * up), abs=0.05)
 
 
 def test_a_face_at_the_side_of_the_picture_that_looks_at_the_camera_is_not_turned_away(track):

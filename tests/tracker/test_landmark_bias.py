@@ -10,7 +10,7 @@ from tests.tracker.test_landmarker import CENTRE, FACING, FOCAL, SIZE
 from tools.build_landmark_bias import View, about_person, learn, left_over
 from tracker import landmark_bias as landmark_bias_module
 from tracker.head import HeadModel, load_head
-from tracker.landmark_bias import FARTHEST_SCORE, FARTHEST_TURN, LandmarkBias, landmark_bias
+from tracker.landmark_bias import FARTHEST_SCORE, FARTHEST_TURN, USUAL_TURN, LandmarkBias, landmark_bias
 from tracker.landmark_indices import MIRRORED, POINTS
 from tracker.landmarker import track_landmarks
 from tracker.raster import project, render
@@ -122,13 +122,26 @@ def test_without_a_face_nothing_is_taken_out(bias: LandmarkBias) -> None:
     assert np.isnan(out[1]).all() and np.isfinite(out[[0, 2, 3, 4]]).all()
     nothing = np.full((2, POINTS, 3), np.nan, np.float32)
     assert np.isnan(bias.taken_out(nothing, used[:2])).all()
-    np.testing.assert_array_equal(
-        bias.taken_out(clip[3:4], used[:1]), clip[3:4]
-    )  # one frame is its own middle
+    np.testing.assert_array_equal(bias.taken_out(clip[:1], used[:1]), clip[:1])  # one frame is its own middle
     np.testing.assert_array_equal(bias.taken_out(clip, ~used), clip)  # no frame tells how the face usually is
     clip[1] = 5.0  # no face's points
     np.testing.assert_array_equal(bias.taken_out(clip, used)[1], clip[1])
     np.testing.assert_array_equal(bias.taken_out(clip, used)[[0, 2, 3, 4]], out[[0, 2, 3, 4]])
+
+
+@pytest.mark.parametrize(("yaw", "nod"), [(0.4, 0.0), (-0.3, 0.0), (0.0, 0.25), (0.09, -0.2)])
+def test_a_face_filmed_from_elsewhere_errs_by_that_throughout(
+    bias: LandmarkBias, yaw: float, nod: float
+) -> None:
+    """Of a turn that is usual, what goes beyond that of a face filmed from the front is taken out of all frames."""
+    clip = np.stack([_seen(bias, yaw, nod)] * 4 + [_seen(bias, 0.0)])
+    moved = bias.taken_out(clip, np.ones(5, bool)) - clip
+    for point, turn, rate in ((7, yaw, (0.02, 0.01)), (9, nod, (0.03, -0.04))):
+        usual = np.clip(turn, -USUAL_TURN, USUAL_TURN)
+        expected = PX_PER_M * np.array(rate)
+        for frame in range(4):
+            np.testing.assert_allclose(moved[frame, point, :2], -(turn - usual) * expected, atol=0.02)
+        np.testing.assert_allclose(moved[4, point, :2], usual * expected, atol=0.02)
 
 
 def test_a_long_clip_is_put_right_as_a_short_one(bias: LandmarkBias, monkeypatch: pytest.MonkeyPatch) -> None:
