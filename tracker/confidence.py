@@ -19,10 +19,8 @@ STRANGE, STRANGE_HALF = 0.10, 0.15  # see Appearance: bare faces stay below .12 
 SHARP, SHARP_HALF = 0.70, 0.55  # of the clip's median
 # Of the lips' landmarks beyond the picture's edge; the landmarker draws those within it closer together.
 CUT_OFF, CUT_OFF_HALF = 0.05, 0.125
-FACING_DEG, FACING_HALF_DEG = (
-    35.0,
-    50.0,
-)  # of the face's axis from the line of sight; landmarks are lost near 60
+# Of the face's axis from the line of sight; landmarks are lost near 60.
+FACING_DEG, FACING_HALF_DEG = 35.0, 50.0
 # What a degree counts from above: a jaw that opens moves back as well as down, which looks like less from there.
 FROM_ABOVE = 2.0
 TURNED = 0.75  # what is left by a turn that is named whatever else is amiss: at 41 degrees
