@@ -3,7 +3,8 @@
 The subject's colours, learned from some 30 frames of the clip, are re-rendered on the mesh of every frame; by how much
 the eyes, the nose and the mouth of that must be shifted to lie on the picture's is found by maximizing their enhanced
 correlation (Evangelidis and Psarakis, 2008). On films whose truth is known the shift errs by .2 to .4 mm. What lies
-beside the picture by as much in all frames alike is learned with the colours, and not told.
+beside the picture by as much in all frames alike is learned with the colours, or is how the search slides over a part
+that is smooth: it is taken out, and not told.
 """
 
 from __future__ import annotations
@@ -32,16 +33,26 @@ STEPS = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-3)
 
 
 def shifts(run: RunFolder, head: HeadModel, used: NDArray[np.bool_]) -> F64:
-    """[T, 4] mm in the picture, of PARTS in the frames used [T]; NaN where the part is not found."""
+    """[T, 4] mm in the picture, of PARTS in the frames used [T], about their usual shifts; NaN where not found."""
     pictures = TrackPictures.of(run, head, ("albedo",))
     assert pictures.albedo is not None
     rows = parts(head, pictures.track.identity)
-    found = np.full((len(used), len(PARTS)), np.nan)
+    found = np.full((len(used), len(PARTS), 2), np.nan)
     for frame, (_, rgb) in enumerate(FrameReader(run.video)):
         if used[frame]:
             seen = pictures.scene(rgb, frame)
             found[frame] = beside(seen, rerender(seen, pictures.albedo), rows)
-    return found
+    return about_usual(found)
+
+
+def about_usual(found: F64) -> F64:
+    """[T, n] mm, how far shifts [T, n, 2] lie from each part's median; NaN where there are none."""
+    apart = np.full(found.shape[:2], np.nan)
+    for part, moved in enumerate(np.moveaxis(found, 1, 0)):
+        known = np.isfinite(moved).all(1)
+        if known.any():
+            apart[known, part] = np.linalg.norm(moved[known] - np.median(moved[known], axis=0), axis=1)
+    return apart
 
 
 def parts(head: HeadModel, identity: F32) -> list[NDArray[np.int64]]:
@@ -64,13 +75,16 @@ def parts(head: HeadModel, identity: F32) -> list[NDArray[np.int64]]:
 
 
 def beside(seen: Scene, rendering: Rendering, rows: list[NDArray[np.int64]]) -> F64:
-    """[n] mm between the parts with vertices `rows` as they should look and in the picture; NaN where not found."""
+    """[n, 2] mm, right and down, from the parts with vertices `rows` as they should look to the picture's.
+
+    NaN where they are not found.
+    """
     blur = max(0.5, BLUR_M * seen.px_per_m)
     expected, picture = (
         cv2.GaussianBlur(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), (0, 0), blur)
         for colour in (rendering.colour, rendering.blurred)
     )
-    found = np.full(len(rows), np.nan)
+    found = np.full((len(rows), 2), np.nan)
     for part, vertices in enumerate(rows):
         places = seen.pixels[vertices, :2] - seen.low
         low = np.maximum(np.floor(places.min(0)).astype(int), 0)
@@ -86,5 +100,5 @@ def beside(seen: Scene, rendering: Rendering, rows: list[NDArray[np.int64]]) -> 
         except cv2.error:  # it does not converge
             continue
         if alike > ALIKE:
-            found[part] = 1e3 * np.linalg.norm(moved[:, 2]) / seen.px_per_m
+            found[part] = 1e3 * moved[:, 2] / seen.px_per_m
     return found

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.beside import PARTS, beside, parts
+from benchmarks.beside import PARTS, about_usual, beside, parts
 from benchmarks.real_tracks import mesh_on_picture
 from tests.tracker.turning_head import SIZE, picture, shifted_landmarks, turning_track
 from tracker.albedo import Rendering
@@ -50,13 +50,23 @@ def test_parts_are_told_to_lie_beside_a_picture_that_is_moved(
     expected = skin(seen, 0)
     known = np.full(expected.shape[:2], 255, np.uint8)
     found = beside(seen, Rendering(expected, known, np.roll(expected, moved_px, axis=0)), rows)
-    np.testing.assert_allclose(found, 1e3 * abs(moved_px) / seen.px_per_m, atol=0.2)
+    expected_mm = np.tile([0, 1e3 * moved_px / seen.px_per_m], (len(PARTS), 1))
+    np.testing.assert_allclose(found, expected_mm, atol=0.2)
 
 
 def test_what_does_not_look_like_it_should_is_not_found(seen: Scene, rows: list[np.ndarray]) -> None:
     known = np.full(seen.raster.triangle.shape, 255, np.uint8)
     other = beside(seen, Rendering(skin(seen, 0), known, skin(seen, 1)), rows)
-    assert np.isnan(other).sum() >= 3
+    assert np.isnan(other).all(1).sum() >= 3
+
+
+def test_what_lies_beside_in_all_frames_alike_is_not_told() -> None:
+    found = np.tile([[1.0, -2.0], [0.5, 0.0]], (5, 1, 1))
+    found[2, 0] += (0.3, 0.4)
+    found[3, 0] = found[:, 1] = np.nan
+    apart = about_usual(found)
+    np.testing.assert_allclose(apart[:, 0], [0, 0, 0.5, np.nan, 0])
+    assert np.isnan(apart[:, 1]).all()
 
 
 def test_the_largest_is_said_with_its_time() -> None:
