@@ -26,7 +26,7 @@ COLUMNS = (
 LIKE_LIPS = 0.2
 # See tracker.lip_lines: sharp clips have .13 and more, a face of 50 px between the eyes .09, blurred ones .07 to .08.
 FINE = 0.083
-# Of the camera, in the median frame: from 18 degrees on openings come out a fifth too narrow.
+# How high the camera stands in the median frame. From about here on openings err by twice what is usual, too narrow.
 FROM_ABOVE_DEG = 13.0
 FACING_CAMERA = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 

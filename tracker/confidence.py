@@ -95,7 +95,10 @@ def _factor(value: NDArray[np.floating], free: float, half: float) -> F64:
 
 
 def off_axis_deg(track: Track) -> F64:
-    """[T] angle between the face's axis and the line from the head to the camera, degrees; more of it from above."""
+    """[T] angle between the face's axis and the line from the head to the camera, degrees.
+
+    The part of it by which the camera stands above counts FROM_ABOVE times.
+    """
     x, y, z = _towards_camera(track).T
     above = np.maximum(y, 0.0) / np.maximum(np.hypot(x, y), 1e-9)
     return np.degrees(np.arccos(np.clip(z, -1.0, 1.0))) * np.sqrt(1.0 + (FROM_ABOVE**2 - 1.0) * above**2)
