@@ -166,6 +166,7 @@ SPOILED: dict[str, tuple[Picture | Spell, int]] = {
     "half a hand, slowly": (Cover((3.0,), 2.0, 2.0, wide=0.55, aside=0.28), 18),
     "shaken, four times": (Shaken((1.5, 4.5, 7.5, 10.0), 0.1, 0.3), 18),
     "a ball, for 5.5 s": (Cover((1.0,), 0.5, 5.5, skin=False, wide=0.56, aside=-0.1), 18),
+    "a ball, from 1 s on": (Cover((1.0,), 0.3, SECONDS, skin=False, wide=0.56, aside=-0.1), 18),
 }
 
 

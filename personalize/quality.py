@@ -28,6 +28,7 @@ LIKE_LIPS = 0.2
 FINE = 0.083
 # How high the camera stands in the median frame. From about here on openings err by twice what is usual, too narrow.
 FROM_ABOVE_DEG = 13.0
+COVERED_OFTEN = 0.2  # of the frames: gestures cover fewer
 FACING_CAMERA = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
@@ -86,6 +87,17 @@ def lip_warnings(refined: Refined) -> list[str]:
             "too narrow; film from the height of the eyes or from below"
         )
     return texts
+
+
+def cover_warnings(reasons: NDArray[np.str_]) -> list[str]:
+    """What the person should know of a face that is covered for long. reasons: [T], of quality.csv."""
+    share = float((reasons == "occluded").mean())
+    if share < COVERED_OFTEN:
+        return []
+    return [
+        f"something covers mouth, cheek or eye in {share:.0%} of the frames (a hand, a microphone, a mask): they are "
+        "left out, and in others it may hide a part of the mouth; film the face free"
+    ]
 
 
 def read_reasons(path: Path) -> NDArray[np.str_]:

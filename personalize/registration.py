@@ -6,6 +6,7 @@ The one place where the tracker's result becomes the model's input.
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,11 +73,13 @@ def register_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     """Write motion.npz and registration.json of a run: the motion, and where its sound lies on its clock."""
     frames = read_frames(run.path / "ingest/frames.npz")
     track = read_track(run.path / "refine/track.npz")
-    used = read_reasons(run.path / "refine/quality.csv") == "ok"
+    reasons = read_reasons(run.path / "refine/quality.csv")
+    used = reasons == "ok"
     if not used.any():
+        ((reason, _),) = Counter(reasons.tolist()).most_common(1)
         raise UserError(
-            f"{run.video}: no frame is tracked with a confidence of {settings.min_confidence}; look at "
-            f"{run.path / 'overlay.mp4'}, and give a better video or a lower --min-confidence"
+            f"{run.video}: no frame is tracked with a confidence of {settings.min_confidence}, mostly for {reason!r}; "
+            f"look at {run.path / 'overlay.mp4'}, and give a better video or a lower --min-confidence"
         )
     track = dataclasses.replace(track, valid=used)
     base = Checkpoint.load(base_path(settings))

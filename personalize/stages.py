@@ -21,7 +21,7 @@ from personalize.heads import head_assets, run_head
 from personalize.ingest import ingest_video
 from personalize.overlay import write_overlay
 from personalize.pictures import FrameReader
-from personalize.quality import frame_reasons, lip_warnings, write_quality
+from personalize.quality import cover_warnings, frame_reasons, lip_warnings, read_reasons, write_quality
 from personalize.registration import register_run
 from personalize.run import RunFolder
 from personalize.settings import Settings
@@ -71,7 +71,7 @@ class Ingest(Stage):
 class LandmarkStage(Stage):
     """478 points and 52 scores on every frame that shows the face, what covers or blurs it, and rigid features."""
 
-    name, version = "landmarks", 10
+    name, version = "landmarks", 11
     needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz", "features.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -214,6 +214,11 @@ class Judge(Stage):
         files.write_track(folder / "track.npz", judged)
         reasons = frame_reasons(frames, judged, doubts, context.settings.min_confidence)
         write_quality(folder / "quality.csv", judged, reasons, refined.deviation[:, 0])
+        for text in cover_warnings(np.array(reasons)):
+            context.report.warn(text)
+
+    def warnings(self, run: RunFolder) -> Sequence[str]:
+        return cover_warnings(read_reasons(run.path / "refine/quality.csv"))
 
 
 class Overlay(Stage):

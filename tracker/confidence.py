@@ -16,6 +16,7 @@ TOLERATED = 1.5  # residuals up to this many times the clip's median cost nothin
 TOLERATED_SKIN = 3.0
 # What costs nothing, and what leaves half of the confidence.
 STRANGE, STRANGE_HALF = 0.10, 0.15  # see Appearance: bare faces stay below .12 in 99.5 % of the frames
+UNLIKE_LIPS, UNLIKE_LIPS_HALF = 0.2, 0.3  # of one lip: bare ones stay below .05 but in a frame of thousands
 SHARP, SHARP_HALF = 0.70, 0.55  # of the clip's median
 # Of the lips' landmarks beyond the picture's edge; the landmarker draws those within it closer together.
 CUT_OFF, CUT_OFF_HALF = 0.05, 0.125
@@ -54,7 +55,8 @@ def bare(appearance: Appearance) -> F32:
 
 
 def _uncovered(appearance: Appearance) -> F64:
-    return _factor(appearance.strangeness, STRANGE, STRANGE_HALF)
+    usual = _factor(appearance.strangeness, STRANGE, STRANGE_HALF)
+    return usual * _factor(appearance.unlike_lips, UNLIKE_LIPS, UNLIKE_LIPS_HALF)
 
 
 def _whole(appearance: Appearance) -> F64:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 POINTS = 478
 RIGHT_EYE_OUTER, LEFT_EYE_OUTER = 33, 263  # the subject's
+NOSE_BRIDGE = 168
 
 _NAMES = """
 _neutral browDownLeft browDownRight browInnerUp browOuterUpLeft browOuterUpRight cheekPuff
@@ -83,6 +84,9 @@ LIPS = (
 # Inner lips from the right corner to the left one, point above point.
 INNER_LIP_UPPER = (78, 191, 80, 81, 82, 13, 312, 311, 310, 415, 308)
 INNER_LIP_LOWER = (78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308)
+# On the red of the lips, between the outer edge and the inner one.
+UPPER_RED = (74, 73, 72, 11, 302, 303, 304, 42, 41, 38, 12, 268, 271, 272)
+LOWER_RED = (90, 180, 85, 16, 315, 404, 320, 89, 179, 86, 15, 316, 403, 319)
 IRIS_CENTRES = (473, 468)  # left, right
 # The rim of the face, from the forehead's middle over the subject's left.
 OVAL = (

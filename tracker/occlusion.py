@@ -2,7 +2,8 @@
 
 The landmarker stays sure of a mouth behind a hand or a box, and the fit follows it there. The colours under the
 landmarks do not: wherever the face turns and whatever it says, they stay near a pattern of its own, which a
-hand's, a cup's or a microphone's are not. The pattern is learned from the clip itself.
+hand's, a cup's or a microphone's are not. The pattern is learned from the clip itself; what is there all the time is
+told by lips that are not red.
 """
 
 from __future__ import annotations
@@ -13,7 +14,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.landmark_indices import IRIS_CENTRES, LEFT_EYE_OUTER, LIPS, OVAL, POINTS, RIGHT_EYE_OUTER
+from tracker.landmark_indices import (
+    IRIS_CENTRES,
+    LEFT_EYE_OUTER,
+    LIPS,
+    LOWER_RED,
+    NOSE_BRIDGE,
+    OVAL,
+    POINTS,
+    RIGHT_EYE_OUTER,
+    UPPER_FACE,
+    UPPER_RED,
+)
 from tracker.landmarker import crop, roi_from_points
 from tracker.track import F32, F64
 
@@ -36,6 +48,10 @@ OFTEN = 0.5
 LEAST_POINTS = 20  # of a region: in a clip of profiles the far side has fewer
 MIDDLE = 0.05  # of the distance between the eyes, to either side
 EYE_REACH = 0.27  # of the distance between the eyes: lids and gaze change within it and cover nothing
+# Of the skin's redness, the logarithm of red over green: lips have half of it at least, mostly more than all, a
+# microphone or a mask none, or less. Where skin has less than TOLD (no colours, coloured light), nothing is told.
+AS_RED, TOLD = 0.4, 0.08
+LIPLESS = 0.1  # of one lip without that colour: such frames teach no pattern, as long as there are others
 
 
 @dataclass(frozen=True)
@@ -46,11 +62,14 @@ class Appearance:
     sharpness: [T] mean Laplacian of the face relative to its brightness, over the clip's median,
         1 where no face is.
     outside: [T] share of the lips' landmarks that lie beyond the picture's edge; 0 where no face is.
+    unlike_lips: [T] share of the upper or of the lower lip, the larger one, that has not the colour of lips;
+        0 where no face is.
     """
 
     strangeness: F32
     sharpness: F32
     outside: F32
+    unlike_lips: F32
 
 
 class FaceWatch:
@@ -88,23 +107,27 @@ class FaceWatch:
     def appearance(self, usable: NDArray[np.bool_]) -> Appearance:
         """Of all pictures seen. usable: [T] bool, those that show the person; the others tell nothing."""
         total, detail = len(self._detail), np.array(self._detail, np.float32)
-        strangeness, outside = np.zeros((2, total), np.float32)
+        strangeness, outside, unlike_lips = np.zeros((3, total), np.float32)
         sharpness = np.ones(total, np.float32)
         seen = np.flatnonzero(np.isfinite(detail) & usable)
         if len(seen):
             colour, place = np.stack(self._colour)[seen], np.stack(self._place)[seen]
             inside = np.stack(self._inside)[seen]
             outside[seen] = 1 - inside[:, list(LIPS)].mean(1)
+            typical = np.median(place, axis=0).astype(np.float64)
+            unlike_lips[seen] = _unlike_lips(colour, inside, typical[:, 0] < typical[NOSE_BRIDGE, 0])
+            with_lips = np.flatnonzero(unlike_lips[seen] <= LIPLESS)
+            teaching = with_lips if len(with_lips) else np.arange(len(seen))
             # Without all of the mouth a face may look as strange as it does.
             inside |= ~inside[:, list(LIPS)].all(1, keepdims=True)
-            for region in regions(np.median(place, axis=0).astype(np.float64), inside.mean(0) > OFTEN):
+            for region in regions(typical, inside.mean(0) > OFTEN):
                 width = np.ptp(place[:, region, 0].astype(np.float32), axis=1)
                 # A side that turns away is seen at a slant, and at its rim the background.
                 slant = np.minimum(width / np.median(width), 1.0) ** 2
-                strange = _strangeness(colour[:, region], inside[:, region])
+                strange = _strangeness(colour[:, region], inside[:, region], teaching)
                 strangeness[seen] = np.maximum(strangeness[seen], slant * strange)
             sharpness[seen] = detail[seen] / max(float(np.median(detail[seen])), 1e-6)
-        return Appearance(strangeness, sharpness, outside)
+        return Appearance(strangeness, sharpness, outside, unlike_lips)
 
 
 def _detail(face: U8) -> float:
@@ -132,14 +155,31 @@ def regions(place: NDArray[np.floating], known: Bool) -> list[NDArray[np.intp]]:
     return [part for part in parts if len(part) >= LEAST_POINTS]
 
 
-def _strangeness(colour: U8, inside: Bool) -> F64:
+def _unlike_lips(colour: U8, inside: Bool, right: Bool) -> F64:
+    """[n] share of the upper or of the lower lip, the larger one, that is less red than lips are.
+
+    What covers a mouth all the time is the clip's own pattern, but has not the colour of anybody's lips. Each side of
+    the face (`right`: [478]) is compared with its own skin, since light may come in two colours. inside: [n, 478];
+    landmarks outside of the picture tell nothing.
+    """
+    logs = _logs(colour)
+    redness = logs[..., 0] - logs[..., 1]
+    upper = np.isin(np.arange(POINTS), UPPER_FACE)
+    skin = np.where(
+        right, *(np.median(redness[:, upper & side], axis=1, keepdims=True) for side in (right, ~right))
+    )
+    lost = (redness < AS_RED * skin) & (skin > TOLD) & inside
+    return np.maximum(*(lost[:, list(lip)].mean(1) for lip in (UPPER_RED, LOWER_RED)))
+
+
+def _strangeness(colour: U8, inside: Bool, teaching: NDArray[np.intp]) -> F64:
     """[n] 1 - correlation of a region's colours [n, R, 3] with the nearest pattern of the face's own.
 
-    inside: [n, R]; landmarks outside of the picture, whose colours are its border's, do not count where they are less
+    teaching: the frames, one at least, of which most show that. inside: [n, R]; landmarks outside of the picture, whose colours are its border's, do not count where they are less
     than half of the region.
     """
     inside = inside | (inside.mean(1, keepdims=True) < OFTEN)
-    learned = np.unique(np.linspace(0, len(colour) - 1, LEARNED).round().astype(int))
+    learned = teaching[np.unique(np.linspace(0, len(teaching) - 1, LEARNED).round().astype(int))]
     shown = inside[learned, :, None]
     usual = (_logs(colour[learned]) * shown).sum(0) / np.maximum(shown.sum(0), 1)
     values = _contrasts(colour[learned], inside[learned], usual)

@@ -16,7 +16,7 @@ from personalize.evaluation import charts
 from personalize.evaluation.evaluate import SYSTEMS, Evaluation
 from personalize.files import write_text
 from personalize.overlay import PREVIEW_S
-from personalize.quality import LeftOut, left_out, lip_warnings, read_reasons
+from personalize.quality import LeftOut, cover_warnings, left_out, lip_warnings, read_reasons
 from personalize.run import RunFolder, read_camera, read_refined, read_track, tool_version
 from personalize.settings import Settings
 from tracker.overlay import MODES
@@ -115,7 +115,8 @@ def _focal(run: RunFolder, tracked: str | None) -> str:
 
 def _warnings(run: RunFolder, media: dict[str, Any]) -> list[str]:
     """What ails the whole clip."""
-    return [*media["warnings"], *lip_warnings(read_refined(run.path / "photometric"))]
+    lips = lip_warnings(read_refined(run.path / "photometric"))
+    return [*media["warnings"], *lips, *cover_warnings(read_reasons(run.path / "refine/quality.csv"))]
 
 
 def _facts(run: RunFolder, media: dict[str, Any], tracked: str | None) -> list[dict[str, str]]:

@@ -133,6 +133,10 @@ def test_the_report_tells_what_ails_the_clip(finished: Path, tmp_path: Path) -> 
     write_refined(out / "photometric", replace(refined, like_lips=0.4))
     texts = _warnings(RunFolder.open(out), media)
     assert len(texts) == len(media["warnings"]) + 1 and "40% of it looks like lips" in texts[-1]
+    quality = out / "refine/quality.csv"
+    quality.write_text(quality.read_text().replace(",ok\n", ",occluded\n"))
+    covered = _warnings(RunFolder.open(out), media)
+    assert covered[:-1] == texts and "a microphone, a mask" in covered[-1]
 
 
 def test_a_report_of_another_trackers_result_is_of_its_camera(finished: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from personalize.evaluation.report import _apart
 from personalize.pipeline import STAGES
 from personalize.quality import (
+    cover_warnings,
     frame_reasons,
     head_angles,
     left_out,
@@ -21,7 +22,7 @@ from personalize.quality import (
 )
 from personalize.run import write_refined
 from personalize.shots import REASONS, Frames
-from personalize.stages import Refine
+from personalize.stages import Judge, Refine
 from tests.personalize.test_registration import track_of
 from tracker.head import load_head
 from tracker.refine import Refined
@@ -103,6 +104,16 @@ def test_a_face_filmed_from_above_is_told(track, nod: float, fineness: float, wa
     seen = replace(track, rotation=rotation, translation=np.tile(np.float32([0, 0, 0.6]), (6, 1)))
     texts = lip_warnings(Refined(seen, np.ones((6, 2), np.float32), 0.1, fineness))
     assert len(texts) == warned and all(f"from above, by some {nod} degrees" in text for text in texts)
+
+
+def test_a_face_that_is_covered_for_long_is_told(tmp_path: Path):
+    hidden = np.array(["ok"] * 5 + ["occluded"] * 2)
+    (text,) = cover_warnings(hidden)
+    assert "in 29% of the frames" in text
+    assert cover_warnings(hidden[:-1]) == []
+    (tmp_path / "refine").mkdir()
+    (tmp_path / "refine/quality.csv").write_text("\n".join(["reason", *hidden]))
+    assert list(Judge().warnings(Mock(path=tmp_path))) == [text]
 
 
 def test_spans_end_where_the_next_frame_begins():

@@ -11,6 +11,10 @@ from tracker.confidence import FROM_ABOVE, bare, confidence, from_above_deg, jud
 from tracker.head import load_head
 from tracker.occlusion import Appearance
 
+NOTHING = np.zeros(4, np.float32)
+CLEAR = Appearance(
+    strangeness=NOTHING, sharpness=np.ones(4, np.float32), outside=NOTHING, unlike_lips=NOTHING
+)
 FACING = np.array([np.pi, 0, 0], np.float32)  # the head's y up and z out of the face, in the camera's axes
 
 
@@ -24,7 +28,7 @@ def track():
 
 def test_nothing_against_a_frame_leaves_its_confidence(track):
     little = np.full(4, 0.05, np.float32)
-    judged, _ = judge(track, Appearance(little, np.ones(4, np.float32), little))
+    judged, _ = judge(track, Appearance(little, CLEAR.sharpness, little, little))
     np.testing.assert_allclose(judged.confidence, track.confidence)
 
 
@@ -32,8 +36,8 @@ def test_the_doubt_is_what_costs_most(track):
     turned = track.rotation.copy()
     turned[2] = turn(60)
     poor = np.float32([1, 1, 1, 0.2])
-    appearance = Appearance(
-        np.float32([0.6, 0, 0, 0.12]), np.float32([1, 0.3, 1, 1]), np.zeros(4, np.float32)
+    appearance = replace(
+        CLEAR, strangeness=np.float32([0.6, 0, 0, 0.12]), sharpness=np.float32([1, 0.3, 1, 1])
     )
     judged, doubts = judge(replace(track, rotation=turned, confidence=poor), appearance)
     assert doubts == ["occluded", "blurred", "turned_away", "poor_fit"]
@@ -44,30 +48,36 @@ def test_a_face_turned_away_is_told_whatever_else_comes_of_it(track):
     """In profile a face lies badly and looks strange for that; turned by a little it does not."""
     turned = track.rotation.copy()
     turned[:3] = turn(42), turn(60), turn(36)
-    nothing = np.zeros(4, np.float32)
-    strange = Appearance(np.float32([0, 0.6, 0, 0.6]), np.ones(4, np.float32), nothing)
+    strange = replace(CLEAR, strangeness=np.float32([0, 0.6, 0, 0.6]))
     poor = np.float32([0.01, 0.01, 0.01, 0.1])
     _, doubts = judge(replace(track, rotation=turned, confidence=poor), strange)
     assert doubts == ["turned_away", "turned_away", "poor_fit", "occluded"]
 
 
 def test_a_mouth_that_looks_other_than_usual_is_a_poor_fit(track):
-    clear = Appearance(np.zeros(4, np.float32), np.ones(4, np.float32), np.zeros(4, np.float32))
     deviation = np.float32([[1, 1], [1, 5], [2.9, 2.9], [np.nan, np.nan]])
-    judged, doubts = judge(track, clear, deviation)
+    judged, doubts = judge(track, CLEAR, deviation)
     expected = track.confidence * np.float32([1, np.exp(-2), 1, 1])
     np.testing.assert_allclose(judged.confidence, expected, rtol=1e-6)
     assert doubts[1] == "poor_fit"
 
 
 def test_a_mouth_beyond_the_pictures_edge_is_cut_off_and_no_evidence(track):
-    cut = Appearance(
-        np.float32([0, 0, 0, 0.15]), np.ones(4, np.float32), np.float32([0.05, 0.125, 0.5, 0.125])
+    cut = replace(
+        CLEAR, strangeness=np.float32([0, 0, 0, 0.15]), outside=np.float32([0.05, 0.125, 0.5, 0.125])
     )
     judged, doubts = judge(track, cut)
     np.testing.assert_allclose(judged.confidence / track.confidence, [1, 0.5, 2**-6, 0.25], rtol=1e-5)
     assert doubts[1:3] == ["cut_off", "cut_off"]
     np.testing.assert_allclose(bare(cut), [1, 0.5, 2**-6, 0.25], rtol=1e-5)
+
+
+def test_lips_without_the_colour_of_lips_are_covered_and_no_evidence(track):
+    covered = replace(CLEAR, unlike_lips=np.float32([0.2, 0.3, 1, 0]))
+    judged, doubts = judge(track, covered)
+    np.testing.assert_allclose(judged.confidence / track.confidence, [1, 0.5, 2**-8, 1], rtol=1e-4)
+    assert doubts[1:3] == ["occluded", "occluded"]
+    np.testing.assert_allclose(bare(covered), [1, 0.5, 2**-8, 1], rtol=1e-4)
 
 
 def turn(yaw_deg):

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tracker.confidence import UNLIKE_LIPS_HALF
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, LIPS, POINTS
 from tracker.occlusion import CONTRAST, FaceWatch, _contrasts, _logs, _unlike, regions
@@ -106,6 +107,58 @@ def test_a_mouth_that_is_covered_on_one_side_looks_strange_however_slowly_it_cam
     assert seen.strangeness[covered == 0].max() < 0.08
 
 
+SKIN = np.array([1.25, 0.85, 0.75])
+
+
+def tinted(cover=None, light=1.0, low=False):
+    """Skin with red lips in some light, which a `cover` of one colour hides from the first frame to the last.
+
+    low: it hides the lower lip alone.
+    """
+
+    def picture_of(frame, picture):
+        matrix = placement(frame)
+        shown = picture * SKIN
+        lips = cv2.convexHull((POINTS_PX[list(LIPS)] @ matrix[:, :2].T + matrix[:, 2]).astype(np.float32))
+        inside = np.zeros((SIDE, SIDE), np.uint8)
+        cv2.fillConvexPoly(inside, lips.round().astype(int), 1)
+        shown[inside == 1] *= [1.0, 0.8, 0.85]
+        if cover is not None:
+            wide = cv2.dilate(inside, np.ones((15, 15), np.uint8))
+            if low:
+                wide[: round((POINTS_PX[13] @ matrix[:, :2].T + matrix[:, 2])[1])] = 0
+            shown[wide == 1] = cover
+        return np.clip(shown * light, 0, 255).astype(np.uint8)
+
+    return picture_of
+
+
+BLUE_LIGHT = np.array([0.35, 0.6, 1.1])
+ACROSS = np.linspace(0, 1, SIDE)[None, :, None]
+TWO_LIGHTS = np.array([1.1, 0.5, 0.6]) * (1 - ACROSS) + np.array([0.55, 0.6, 1.1]) * ACROSS
+
+
+@pytest.mark.parametrize("low", [False, True])
+@pytest.mark.parametrize("cover", [(38, 36, 36), (90, 140, 180)])
+def test_what_covers_the_lips_all_the_time_is_told_by_its_colour(cover, low: bool):
+    seen = look(*clip(spoil=tinted(cover, low=low)))
+    assert seen.strangeness.max() < 0.1  # it is the clip's own pattern
+    assert seen.unlike_lips.min() > UNLIKE_LIPS_HALF
+
+
+@pytest.mark.parametrize("light", [1.0, 0.2, BLUE_LIGHT, TWO_LIGHTS])
+def test_lips_are_as_red_as_skin_in_any_light(light):
+    assert look(*clip(spoil=tinted(light=light))).unlike_lips.max() < 0.05
+
+
+def test_without_colours_nothing_is_told_of_lips_that_are_not_red():
+    def grey(frame, picture):
+        shown = cv2.cvtColor(tinted((38, 36, 36))(frame, picture), cv2.COLOR_RGB2GRAY)
+        return np.repeat(shown[..., None], 3, axis=2)
+
+    assert look(*clip(spoil=grey)).unlike_lips.max() == 0
+
+
 def lifted(frames, landmarks, cut_px):
     """The same without the upper cut_px [T] px of each picture, whose face then lies as much higher."""
     points = landmarks.points.copy()
@@ -139,6 +192,15 @@ def test_lips_beyond_the_pictures_edge_are_told():
     expected[40:50] = 0
     assert 0.3 < expected.max() < 0.9
     np.testing.assert_allclose(seen.outside, expected)
+
+
+def test_lips_beyond_the_pictures_edge_are_no_covered_ones():
+    low = int(POINTS_PX[list(LIPS), 1].min()) - 4
+    landmarks = clip()[1]
+    still = [(frame / 25, tinted()(0, texture(0))[:low]) for frame in range(FRAMES)]
+    still = [(time, np.concatenate([rgb[:-2], np.full_like(rgb[:2], 40)])) for time, rgb in still]
+    landmarks.points[..., :2] = POINTS_PX
+    assert look(still, landmarks).unlike_lips.max() == 0
 
 
 def test_light_that_comes_from_elsewhere_little_by_little_is_no_cover():

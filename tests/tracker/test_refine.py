@@ -302,7 +302,7 @@ def test_a_covered_mouth_loses_confidence(film: Film):
         cv2.rectangle(picture, (low - 35).tolist(), (low + 35).tolist(), (250, 240, 230), -1)
     refined = film.refine(pictures)
     nothing = np.zeros(FRAMES, np.float32)
-    clear = Appearance(nothing, np.ones(FRAMES, np.float32), nothing)
+    clear = Appearance(nothing, np.ones(FRAMES, np.float32), nothing, nothing)
     trust = judge(refined.track, clear, refined.deviation)[0].confidence
     assert trust[10:13].max() < 0.5 * np.delete(trust, [10, 11, 12]).min()
 
