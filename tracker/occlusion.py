@@ -175,8 +175,8 @@ def _unlike_lips(colour: U8, inside: Bool, right: Bool) -> F64:
 def _strangeness(colour: U8, inside: Bool, teaching: NDArray[np.intp]) -> F64:
     """[n] 1 - correlation of a region's colours [n, R, 3] with the nearest pattern of the face's own.
 
-    teaching: the frames, one at least, of which most show that. inside: [n, R]; landmarks outside of the picture, whose colours are its border's, do not count where they are less
-    than half of the region.
+    teaching: the frames, one at least, of which most show that. inside: [n, R]; landmarks outside of the picture,
+    whose colours are its border's, do not count where they are less than half of the region.
     """
     inside = inside | (inside.mean(1, keepdims=True) < OFTEN)
     learned = teaching[np.unique(np.linspace(0, len(teaching) - 1, LEARNED).round().astype(int))]
