@@ -15,7 +15,7 @@ from personalize.files import sha256_file
 from personalize.restricted_pickle import read_pickle
 from personalize.settings import Settings
 from personalize.user_arrays import read_user_npz
-from tracker.flame import ARRAYS, SurfacePoints, flame_head
+from tracker.flame import ARRAYS, EmbeddedPoints, flame_head
 from tracker.head import ASSET, HeadModel, load_head
 from tracker.landmark_indices import IBUG_51
 from tracker.track import TrackError
@@ -62,7 +62,7 @@ def read_flame(path: Path, embedding: Path) -> HeadModel:
     return head
 
 
-def read_embedding(path: Path) -> SurfacePoints:
+def read_embedding(path: Path) -> EmbeddedPoints:
     """Landmarks on FLAME's surface: MediaPipe's 105 as .npz, or iBUG's 51 as .pkl."""
     if path.suffix == ".npz":
         data: dict[Any, Any] = read_user_npz(path, EMBEDDING_KEYS)
@@ -74,7 +74,7 @@ def read_embedding(path: Path) -> SurfacePoints:
         )
     try:
         triangles, shares, landmarks = (np.asarray(data[key]) for key in EMBEDDING_KEYS)
-        points = SurfacePoints(
+        points = EmbeddedPoints(
             landmarks.astype(np.int32).ravel(), triangles.astype(np.int32).ravel(), shares.astype(np.float32)
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from personalize.files import write_text
-from personalize.shots import Frames
+from personalize.shots import REASONS, Frames
 from tracker.confidence import from_above_deg
 from tracker.refine import Refined
 from tracker.track import F32, Track
@@ -28,7 +28,7 @@ LIKE_LIPS = 0.2
 FINE = 0.083
 # How high the camera stands in the median frame. From about here on openings err by twice what is usual, too narrow.
 FROM_ABOVE_DEG = 13.0
-COVERED_OFTEN = 0.2  # of the frames: gestures cover fewer
+COVERED_OFTEN = 0.2  # of the frames that show the face: gestures cover fewer
 FACING_CAMERA = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
@@ -91,12 +91,13 @@ def lip_warnings(refined: Refined) -> list[str]:
 
 def cover_warnings(reasons: NDArray[np.str_]) -> list[str]:
     """What the person should know of a face that is covered for long. reasons: [T], of quality.csv."""
-    share = float((reasons == "occluded").mean())
-    if share < COVERED_OFTEN:
+    shown = ~np.isin(reasons, REASONS[1:])
+    covered = (reasons == "occluded").sum() / max(shown.sum(), 1)
+    if covered < COVERED_OFTEN:
         return []
     return [
-        f"something covers mouth, cheek or eye in {share:.0%} of the frames (a hand, a microphone, a mask): they are "
-        "left out, and in others it may hide a part of the mouth; film the face free"
+        f"something covers mouth, cheek or eye in {covered:.0%} of the frames that show the face (a hand, a "
+        "microphone, a mask): they are left out, and in others it may hide a part of the mouth; film the face free"
     ]
 
 

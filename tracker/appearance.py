@@ -80,10 +80,10 @@ def skin_of(head: HeadModel, model: LandmarkModel, identity: F32) -> Skin:
 
 
 def _to_line(points: F32, lines: Sequence[F32]) -> F32:
-    """[P] m from points [P, 3] to the nearest of lines [.., 3]."""
+    """[P] m from points [P, 3] to the nearest of lines [.., 3], which may be of one point."""
     share = np.linspace(0, 1, DENSER)[:, None, None]
     dense = [(line[:-1] + share * np.diff(line, axis=0)).reshape(-1, 3) for line in lines]
-    return cKDTree(np.concatenate(dense)).query(points)[0].astype(np.float32)
+    return cKDTree(np.concatenate([*lines, *dense])).query(points)[0].astype(np.float32)
 
 
 def _spread(corners: F32) -> tuple[NDArray[np.int64], F32]:

@@ -22,7 +22,7 @@ from tracker.key_frames import farthest
 from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, of_rigid_face
 from tracker.rigid_surface import SurfacePoints, surface_points
 from tracker.similarity import similarity
-from tracker.track import F64, Bundle, Camera, Landmarks
+from tracker.track import F64, Bundle, Camera, Landmarks, TrackError
 
 PRIOR_FOCAL = 1.3  # of the picture's long side: phones and webcams .7-1.2, camcorders and portraits 1.2-2.5
 PRIOR_SD_LOG = 0.35
@@ -32,8 +32,8 @@ FILM_MM = 36.0
 MIDDLE, MIDDLE_SD_LOG = 1.1, 0.12
 FOCAL_RANGE = (0.45, 5.0)  # of the long side
 LEAST_SD_LOG = 0.08  # of log(focal): what light and skin that moves do to all tracks alike
-# Of PRIOR_SD_LOG: a clip that leaves more of it has told nothing. Beside a lens that was written down it always has its
-# say.
+# Of PRIOR_SD_LOG: a clip that leaves more of it has told nothing. Beside a lens that was written down it has its say
+# whatever it leaves.
 TOLD = 0.8
 MIN_TURN_DEG = 8.0  # a head that turns less leaves focal length and depth undecided
 # Of the distance between the outer eye corners: farther landmarks, and points that were followed, do not count for a
@@ -58,7 +58,10 @@ def estimate_camera(
     features: what was followed through the frames of the landmarks. focal_given: px, then nothing is estimated but
     poses and points. distortion: its radial coefficients, see `Lens`. recorded_mm: what the camera wrote of its focal
     length, on film 36 mm wide; 0 if nothing.
+    Raises TrackError for a distortion without the focal length that it was measured with.
     """
+    if distortion and not focal_given:
+        raise TrackError("a lens's distortion goes with its focal length: give both")
     prior = _camera(landmarks.size, focal_given, distortion, recorded_mm)
     tracks = _not_aside(_straight(features, prior), landmarks)
     some = tracks.select(_telling(landmarks.points[tracks.frames]), MOST_POINTS)

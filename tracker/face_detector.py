@@ -139,9 +139,12 @@ class FaceDetector:
         for divisor in TILE_DIVISORS if tiled else ():
             if found:
                 break
-            for left, top, side in tiles(width, height, divisor):
-                found += self._detect_in(rgb[top : top + side, left : left + side], (left, top))
-        return merged(found)
+            parts = (
+                self._detect_in(rgb[top : top + side, left : left + side], (left, top))
+                for left, top, side in tiles(width, height, divisor)
+            )
+            found = merged([face for part in parts for face in part])
+        return found
 
     def _detect_in(self, rgb: NDArray[np.uint8], offset: tuple[int, int]) -> list[Face]:
         """Faces, in px of the whole picture, in one cut-out at `offset` (left, top)."""

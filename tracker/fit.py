@@ -26,6 +26,7 @@ from tracker.energy import (
 )
 from tracker.gaze import eye_rotations
 from tracker.key_frames import KeyFrames, key_frames
+from tracker.landmarker import MIN_PRESENCE
 from tracker.similarity import similarity
 from tracker.solver import Smoothness, solve_frames, solve_subject
 from tracker.track import F32, F64, Camera, Landmarks, Track, TrackError
@@ -33,7 +34,6 @@ from tracker.track import F32, F64, Camera, Landmarks, Track, TrackError
 if TYPE_CHECKING:
     from tracker.head import HeadModel
 
-MIN_PRESENCE = 0.5
 LEAST_EVIDENCE = 0.02  # of a covered frame: enough to hold a pose where no neighbour does
 LIP_BIAS = 0.001  # m
 # Times the usual time between measured frames, and at least so long: what is missing does not end a run sooner.
@@ -266,7 +266,7 @@ def _nearest(total: int, good: Frames) -> Frames:
 
 
 def lip_gaps(head: HeadModel, identity: NDArray[np.floating], expression: F32, jaw: F32) -> F32:
-    """[n] mm, a hundred frames at a time to bound memory."""
+    """[n] mm, some hundred frames at a time to bound memory."""
     subject = np.asarray(identity, np.float32)
     parts = [
         head.lip_gap_mm(head.vertices(subject, expression[rows], jaw=jaw[rows]))

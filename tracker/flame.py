@@ -31,7 +31,7 @@ Arrays = Mapping[str, NDArray[np.generic]]
 
 
 @dataclass(frozen=True)
-class SurfacePoints:
+class EmbeddedPoints:
     """Landmarks on FLAME's surface: [L] of the 478 points, [L] faces, [L, 3] barycentric coordinates."""
 
     landmarks: NDArray[np.int32]
@@ -40,7 +40,7 @@ class SurfacePoints:
 
 
 def flame_head(
-    name: str, arrays: Arrays, points: SurfacePoints, masks: Mapping[str, NDArray[np.int32]]
+    name: str, arrays: Arrays, points: EmbeddedPoints, masks: Mapping[str, NDArray[np.int32]]
 ) -> HeadModel:
     """FLAME with signed expressions and joints for neck, jaw and eyes.
 
@@ -138,7 +138,7 @@ def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
     return checked
 
 
-def _check_points(points: SurfacePoints, faces: int) -> None:
+def _check_points(points: EmbeddedPoints, faces: int) -> None:
     count = len(points.landmarks)
     if points.triangles.shape != (count,) or points.barycentric.shape != (count, 3):
         raise TrackError(
@@ -154,7 +154,7 @@ def _check_points(points: SurfacePoints, faces: int) -> None:
         raise TrackError("the landmark embedding is damaged: barycentric coordinates do not sum to 1")
 
 
-def _check_area(points: SurfacePoints, template: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
+def _check_area(points: EmbeddedPoints, template: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
     corners = template[faces[points.triangles]]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     if not (area > LEAST_AREA_M2).all():
@@ -185,7 +185,7 @@ def _joint(skeleton: Skeleton, row: int) -> Joint:
 
 
 def _embedding(
-    points: SurfacePoints,
+    points: EmbeddedPoints,
     skeleton: Skeleton,
     template: NDArray[np.float64],
     faces: NDArray[np.int32],

@@ -7,6 +7,8 @@ ears of the average head.
 from __future__ import annotations
 
 import hashlib
+import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -23,6 +25,8 @@ from tracker.track import F32, TrackError
 I32 = NDArray[np.int32]
 
 ASSET = Path(__file__).parent / "assets" / "head.npz"
+# What reading a file that is no `.npz`, or a broken one, raises.
+DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
@@ -197,7 +201,7 @@ def read_landmark_embedding(path: Path) -> LandmarkEmbedding:
                 barycentric=file["barycentric"],
                 head_sha256=str(file["head_sha256"]),
             )
-    except (OSError, ValueError, KeyError) as error:
+    except DAMAGED as error:
         raise TrackError(f"{path}: not a landmark embedding ({error})") from error
 
 
@@ -207,7 +211,7 @@ def read_head(path: Path) -> HeadModel:
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
         return _assemble(path.stem, arrays)
-    except (OSError, ValueError, KeyError) as error:
+    except DAMAGED as error:
         raise TrackError(f"{path}: not a head model ({error})") from error
 
 

@@ -47,12 +47,12 @@ class Modes:
         return len(self.to_head)
 
     def head_weights(self, weights: F64) -> tuple[F64, F64]:
-        """[.., K] the solver's weights -> the head's expression [.., Ke] and jaw [.., 3] rad."""
+        """[.., K] the solver's weights -> the head's expression [.., Ke], within its range, and jaw [.., 3] rad."""
         both = weights @ self.to_head
         return np.clip(both[..., :-3], *self.expression_range), both[..., -3:]
 
     def of_head(self, expression: F64, jaw: F64) -> F64:
-        """[.., K] the inverse of `head_weights`, within the bounds."""
+        """[.., K] the inverse of `head_weights`, within the bounds, where that has cut nothing off."""
         weights = np.concatenate([expression, jaw], axis=-1) @ np.linalg.pinv(self.to_head)
         return np.clip(weights, self.lower, self.upper)
 

@@ -56,14 +56,12 @@ LIPLESS = 0.1  # of one lip without that colour: such frames teach no pattern, a
 
 @dataclass(frozen=True)
 class Appearance:
-    """How each frame's face looks.
+    """How each frame's face looks; 0, of the sharpness 1, where no face is or the frame is not usable.
 
-    strangeness: [T] 0..2, 1 - correlation of the region that looks least like the face's own; 0 where no face is.
-    sharpness: [T] mean Laplacian of the face relative to its brightness, over the clip's median,
-        1 where no face is.
-    outside: [T] share of the lips' landmarks that lie beyond the picture's edge; 0 where no face is.
-    unlike_lips: [T] share of the upper or of the lower lip, the larger one, that has not the colour of lips;
-        0 where no face is.
+    strangeness: [T] 0..2, 1 - correlation of the region that looks least like the face's own.
+    sharpness: [T] mean Laplacian of the face relative to its brightness, over the clip's median.
+    outside: [T] share of the lips' landmarks that lie beyond the picture's edge.
+    unlike_lips: [T] share of the upper or of the lower lip, the larger one, that has not the colour of lips.
     """
 
     strangeness: F32

@@ -16,7 +16,7 @@ from tracker.lip_lines import LipLines, fineness
 from tracker.lip_motion import steadied
 from tracker.lip_opening import lip_edges
 from tracker.rigid_pose import hold_poses, turned_as_far
-from tracker.skin_fit import Level, Photometry, Subject, fit_landmarks, fit_stretch, learn_levels
+from tracker.skin_fit import Level, Subject, fit_landmarks, fit_stretch, learn_levels
 from tracker.skin_identity import fit_identity_to_skin, nearer_to_skin
 from tracker.threads import side_by_side
 from tracker.track import F32, F64, Bundle, Camera, Landmarks, Track
@@ -60,7 +60,6 @@ def refine_track(
     segment: NDArray[np.int32],
     frames: Callable[[], Iterable[Frame]],
     progress: Callable[[int, int], None] | None = None,
-    photometry: Photometry | None = None,
     evidence: F32 | None = None,
 ) -> Refined:
     """Identity, and expression, pose and gaze of the valid frames again, with the pictures; the camera stays.
@@ -75,13 +74,12 @@ def refine_track(
     lips move (tracker/lip_opening.py, tracker/lip_motion.py), depth by how the skin shifts in a turn
     (tracker/skin_identity.py), pose and jitter by the grey levels of the skin.
     """
-    photometry = photometry or Photometry()
     energy, x, observed, good = resume(track, landmarks, camera, head, evidence)
     unknown = np.full((len(track.time), 2), np.nan, np.float32)
     if not len(good):
         return Refined(track, unknown)
     sound = trusted(evidence, good)
-    subject = Subject.of(head, track.identity, energy, photometry, camera.size)
+    subject = Subject.of(head, track.identity, energy, observed, camera.size)
     lines = LipLines.across(observed, energy.px_per_m, x)
     count = int(np.clip(len(sound) // KEYS_APART, *KEYS))
     usual = sound[np.linspace(0, len(sound) - 1, count).round().astype(int)]

@@ -87,10 +87,14 @@ class Subject:
 
     @classmethod
     def of(
-        cls, head: HeadModel, identity: F32, energy: Energy, photometry: Photometry, size: tuple[int, int]
+        cls, head: HeadModel, identity: F32, energy: Energy, observed: F64, size: tuple[int, int]
     ) -> Subject:
-        """The subject with sample points on the skin and windows around the landmarks. size: of the pictures, px."""
-        window = Window.around(energy.observed, energy.px_per_m, photometry.finest_px_per_m, size)
+        """The subject with sample points on the skin and windows around the landmarks.
+
+        observed: [n, 478, 2] px; a user's head may know few of them, with no chin. size: of the pictures, px.
+        """
+        photometry = Photometry()
+        window = Window.around(observed, energy.px_per_m, photometry.finest_px_per_m, size)
         weights = replace(
             energy.weights,
             pair_noise_mm=photometry.pair_noise_mm,

@@ -125,12 +125,11 @@ def bounded_step(
 
 @dataclass(frozen=True)
 class Solution:
-    """identity [Ki]; x [n, P]; value: the energy; steps: accepted ones."""
+    """identity [Ki]; x [n, P]; value: the energy."""
 
     identity: F64
     x: F64
     value: float
-    steps: int
 
 
 class SharedEnergy(Protocol):
@@ -162,7 +161,7 @@ def solve_subject(energy: SharedEnergy, identity: F64, x: F64, steps: int = 20) 
     def total(identity: F64, x: F64) -> float:
         return float(energy.value(energy.shape(identity), x).sum() + 0.5 * prior * identity @ identity)
 
-    damping, value, done = 1e-3, total(identity, x), 0
+    damping, value = 1e-3, total(identity, x)
     for _ in range(steps):
         quadratic = energy.linearize(energy.shape(identity), x, True)
         while True:
@@ -176,10 +175,10 @@ def solve_subject(energy: SharedEnergy, identity: F64, x: F64, steps: int = 20) 
         if not trial_value < value:
             break
         gain, value = value - trial_value, trial_value
-        identity, x, damping, done = trial_identity, trial, max(damping / 5, 1e-6), done + 1
+        identity, x, damping = trial_identity, trial, max(damping / 5, 1e-6)
         if gain < CONVERGED * value:
             break
-    return Solution(identity, x, value, done)
+    return Solution(identity, x, value)
 
 
 def schur_step(

@@ -26,7 +26,8 @@ class Landmarks:
     time: [T] s, presentation time from the first video frame.
     points: [T, 478, 3], x right and y down in pixels of the upright picture (pixel centres at integers),
         z in the same scale; NaN where there is no face.
-    presence: [T], 0..1; the landmarker's own face probability, 0 where there is no face.
+    presence: [T], 0..1; the landmarker's own face probability, less where a crop and its mirror image are read
+        apart; 0 where there is no face.
     blendshapes: [T, 52], 0..1, in the order of `blendshape_names`.
     size: (width, height) of the upright picture in pixels.
     """
@@ -43,7 +44,7 @@ class Landmarks:
 class Camera:
     """Pinhole camera of one clip. `focal_sd_log` is the standard deviation of log(focal).
 
-    distortion: radial coefficients (k1, k2, …) of OpenCV's model, empty for none.
+    distortion: radial coefficients (k1, k2, k3) of OpenCV's model, empty for none.
     method: `bundle` when the clip's own motion decided, or had its say beside a lens that the camera wrote down;
     `prior` when the stated prior did; `given` by the user.
     prior: the sentence that states the prior used.
@@ -68,7 +69,8 @@ class Bundle:
     """Rigid evidence of the feature tracks on the upper face.
 
     frame: [M] i4, frames that have a pose. rotation: [M, 3] axis-angle, rad, and translation: [M, 3] m take
-    `points` to the camera frame (OpenCV axes). points: [Q, 3] m. observations: [O, 4] (frame, point, x px, y px).
+    `points` to the camera frame (OpenCV axes). points: [Q, 3] m. observations: [O, 4] (frame, point, x px, y px), the
+    lens's distortion taken out.
     """
 
     frame: NDArray[np.int32]

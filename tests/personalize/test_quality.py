@@ -107,10 +107,11 @@ def test_a_face_filmed_from_above_is_told(track, nod: float, fineness: float, wa
 
 
 def test_a_face_that_is_covered_for_long_is_told(tmp_path: Path):
-    hidden = np.array(["ok"] * 5 + ["occluded"] * 2)
+    hidden = np.array(["ok"] * 5 + ["occluded"] * 2 + ["duplicate", "no_face", "cut"])
     (text,) = cover_warnings(hidden)
-    assert "in 29% of the frames" in text
-    assert cover_warnings(hidden[:-1]) == []
+    assert "in 29% of the frames that show" in text
+    assert cover_warnings(np.array(["ok"] * 5 + ["occluded"])) == []
+    assert cover_warnings(np.array(["no_face"])) == []
     (tmp_path / "refine").mkdir()
     (tmp_path / "refine/quality.csv").write_text("\n".join(["reason", *hidden]))
     assert list(Judge().warnings(Mock(path=tmp_path))) == [text]

@@ -21,7 +21,7 @@ from tracker.landmark_indices import LEFT_EYE, POINTS, RIGHT_EYE, UPPER_FACE
 from tracker.patch_registration import fine_texture
 from tracker.raster import project
 from tracker.rigid_surface import SurfacePoints
-from tracker.track import F64, Landmarks
+from tracker.track import F64, Landmarks, TrackError
 
 SIZE, FOCAL = (640, 480), 1100.0
 CENTRE = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
@@ -204,6 +204,8 @@ def test_a_given_lens_is_taken_out(head: HeadModel) -> None:
     between = Rotation.from_rotvec(straight.rotation).inv() * Rotation.from_rotvec(bundle.rotation)
     assert np.degrees(between.magnitude().max()) < 0.05
     np.testing.assert_allclose(bundle.observations, straight.observations, atol=0.02)
+    with pytest.raises(TrackError, match="give both"):
+        estimate_camera(marks, tracks, head, distortion=(k1,))
 
 
 def _bent(xy: np.ndarray, k1: float) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from tests.flame_factory import EMBEDDED, FakeFlame
 from tracker.energy import Weights
 from tracker.fit import fit_track
-from tracker.flame import SurfacePoints, flame_head
+from tracker.flame import EmbeddedPoints, flame_head
 from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, IBUG_51, MIRRORED, POINTS, UPPER_FACE, of_rigid_face
 from tracker.modes import head_modes, movements
@@ -19,9 +19,9 @@ from tracker.track import Camera, Landmarks, TrackError
 RNG = np.random.default_rng(5)
 
 
-def surface(fake: FakeFlame, landmarks: tuple[int, ...] = EMBEDDED) -> SurfacePoints:
+def surface(fake: FakeFlame, landmarks: tuple[int, ...] = EMBEDDED) -> EmbeddedPoints:
     data = fake.embedding(landmarks)
-    return SurfacePoints(
+    return EmbeddedPoints(
         data["landmark_indices"].astype(np.int32),
         data["lmk_face_idx"].astype(np.int32),
         data["lmk_b_coords"].astype(np.float32),

@@ -249,13 +249,24 @@ def test_an_embedding_of_another_head_is_refused(head: HeadModel) -> None:
 def test_damaged_files_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(TrackError, match="not a head model"):
         read_head(tmp_path / "missing.npz")
+    with pytest.raises(TrackError, match="not a landmark embedding"):
+        read_landmark_embedding(tmp_path / "missing.landmarks.npz")
+    whole = ASSET.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 3] ^= 255
     path = tmp_path / "head.npz"
-    path.write_bytes(b"not an archive")
-    with pytest.raises(TrackError, match="not a head model"):
-        read_head(path)
-    for embedding in (path, tmp_path / "missing.landmarks.npz"):
+    for content in (
+        b"not an archive",
+        b"",
+        whole[: len(whole) // 2],
+        b"PK\x03\x04" + whole[:50],
+        bytes(flipped),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(TrackError, match="not a head model"):
+            read_head(path)
         with pytest.raises(TrackError, match="not a landmark embedding"):
-            read_landmark_embedding(embedding)
+            read_landmark_embedding(path)
 
 
 def test_the_inner_lips_landmarks_lie_each_on_its_own_lip():

@@ -236,6 +236,15 @@ def test_points_know_how_far_the_mouths_inside_is():
     assert skin.to_inside.min() < 0.002 and skin.to_inside[~skin.mouth].min() > 0.01
 
 
+def test_a_head_that_knows_one_point_of_each_inner_lip_has_a_mouth():
+    lines = {f"inner_lip_{lip}": HEAD.regions[f"inner_lip_{lip}"] for lip in ("upper", "lower")}
+    middles = {name: line[[len(line) // 2]] for name, line in lines.items()}
+    skin = skin_of(replace(HEAD, regions=HEAD.regions | middles), MODEL, IDENTITY)
+    vertices = HEAD.template[np.concatenate(list(middles.values()))] - MODEL.centre
+    to_middle = np.linalg.norm(skin.rest[:, None] - vertices, axis=-1).min(1)
+    np.testing.assert_allclose(skin.to_inside, to_middle, atol=1e-6)
+
+
 def test_skin_moves_as_a_flame_head_does():
     fake = FakeFlame()
     flame = flame_head("flame", arrays(fake), surface(fake), {})

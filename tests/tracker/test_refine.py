@@ -12,12 +12,12 @@ from tracker.confidence import judge
 from tracker.energy import LIP_PAIRS, rotation_matrix
 from tracker.fit import fit_track, make_track, resume
 from tracker.head import load_head
-from tracker.landmark_indices import BLENDSHAPE_NAMES, POINTS
+from tracker.landmark_indices import BLENDSHAPE_NAMES, IBUG_51, POINTS
 from tracker.lip_lines import LipLines
 from tracker.occlusion import Appearance
 from tracker.raster import render
 from tracker.refine import _overlap, _read_widths, _stretches, _with_landmarks, refine_track
-from tracker.skin_fit import Photometry, Subject, fit_stretch, learn_levels
+from tracker.skin_fit import Subject, fit_stretch, learn_levels
 from tracker.solver import Smoothness
 from tracker.track import Bundle, Camera, Landmarks, Track
 
@@ -152,8 +152,8 @@ def test_how_fine_the_light_is_is_told_by_the_whole_clip(dark_mouth: Film, monke
 
 def test_what_moves_all_key_frames_alike_is_taken_for_an_error_of_the_albedo(film: Film):
     """Grey levels tell how frames differ: their mean stays where landmarks have it."""
-    energy, x, _, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
-    subject, rows = Subject.of(HEAD, film.track.identity, energy, Photometry(), SIZE), np.arange(0, FRAMES, 3)
+    energy, x, observed, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
+    subject, rows = Subject.of(HEAD, film.track.identity, energy, observed, SIZE), np.arange(0, FRAMES, 3)
     cuts, x = [subject.window.cut(film.pictures[row], row) for row in rows], x[rows]
     levels, alone = learn_levels(subject, cuts, rows, x), Smoothness.none(*x.shape)
     free = [replace(level, pull=0 * level.pull) for level in levels]
@@ -167,8 +167,8 @@ def test_what_moves_all_key_frames_alike_is_taken_for_an_error_of_the_albedo(fil
 
 def test_skin_beside_the_mouths_inside_is_not_compared(film: Film):
     """What a blur mixes with teeth and dark: the coarser it is, the more."""
-    energy, _, _, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
-    subject, rows = Subject.of(HEAD, film.track.identity, energy, Photometry(), SIZE), np.zeros(1, np.int64)
+    energy, _, observed, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
+    subject, rows = Subject.of(HEAD, film.track.identity, energy, observed, SIZE), np.zeros(1, np.int64)
     cut, whole = subject.window.cut(film.pictures[0], 0), np.ones((1, len(subject.skin)), np.float32)
     for blur_px in (1.0, 3.0):
         seen = subject.photometric([cut], rows, whole, blur_px).seen[0]
@@ -177,10 +177,25 @@ def test_skin_beside_the_mouths_inside_is_not_compared(film: Film):
         np.testing.assert_allclose(seen[subject.skin.to_inside > 0.005], 0.1)
 
 
+def test_a_head_that_knows_few_landmarks_has_its_chin_in_the_window(film: Film):
+    """A user's embedding may end at the lips."""
+    embedding = HEAD.landmark_embedding
+    few = np.isin(embedding.landmarks, IBUG_51)
+    parts = {name: getattr(embedding, name)[few] for name in ("landmarks", "triangles", "barycentric")}
+    sparse = replace(HEAD, landmark_embedding=replace(embedding, **parts))
+    seen = []
+    for head in (HEAD, sparse):
+        energy, x, observed, _ = resume(film.track, film.landmarks, CAMERA, head)
+        subject = Subject.of(head, film.track.identity, energy, observed, SIZE)
+        seen.append(subject.look(np.zeros(1, np.int64), x[:1])[0][0])
+    assert seen[0].sum() > 1000
+    np.testing.assert_array_equal(*seen)
+
+
 def test_skin_outside_of_the_picture_is_not_seen(film: Film):
-    energy, x, _, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
+    energy, x, observed, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
     first, size = np.zeros(1, np.int64), (SIZE[0], 150)
-    whole, cut = (Subject.of(HEAD, film.track.identity, energy, Photometry(), s) for s in (SIZE, size))
+    whole, cut = (Subject.of(HEAD, film.track.identity, energy, observed, s) for s in (SIZE, size))
     seen, fewer = (subject.look(first, x[first])[0][0] > 0 for subject in (whole, cut))
     # In the first frame the face is at rest.
     place = whole.skin.rest @ rotation_matrix(x[:1, -6:-3])[0].T + x[0, -3:]
@@ -205,7 +220,7 @@ def test_what_landmarks_read_of_shut_lips_is_forgotten_when_colours_read_them(fi
     far = replace(energy, model=replace(energy.model, touch=energy.model.touch + 0.001))
     near, apart = (
         _with_landmarks(
-            Subject.of(HEAD, film.track.identity, start, Photometry(), SIZE), read, x, sound
+            Subject.of(HEAD, film.track.identity, start, observed, SIZE), read, x, sound
         ).energy.model
         for start in (energy, far)
     )
