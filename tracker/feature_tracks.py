@@ -129,7 +129,7 @@ class FeatureFollower:
     ) -> None:
         """time: [T] s. usable: [T]. segments: [T], number of the uninterrupted shot.
 
-        boxes: [T, 4] px, left, top, right, bottom of the face, NaN where it is not seen: they tell its usual size.
+        boxes: [T, 4] px, left, top, right, bottom of the face, finite in usable frames: they tell its usual size.
         """
         self._time, self._usable, self._segments = time, usable, segments
         self._size = np.ones(len(time)) if boxes is None else (boxes[:, 2:] - boxes[:, :2]).max(1)

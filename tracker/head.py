@@ -60,10 +60,10 @@ class HeadModel:
     side. identity_basis: [Ki, D, 3] m per standard deviation. expression_basis: [Ke, D, 3] m at weight 1, in the order
     of `expression_names`: ARKit's, weights 0..1, then LIP_SHAPES (tracker/modes.py), -1..1. joints: `left_eye`,
     `right_eye`, of FLAME `neck` and `jaw` too. regions: name -> vertex indices; `inner_lip_upper` and `inner_lip_lower`
-    run from the right to the left corner and are paired, the two ends being the corners. albedo: [D, 3] u8 sRGB of a
-    painted neutral skin. sha256: of the geometry. skeleton: of a head that turns its jaw and neck by joints, which then
-    turn the eyes too; None for one that moves the jaw by expressions. signed: expression weights are standard
-    deviations of either sign and names mean nothing.
+    run from the right to the left corner and are paired, the two ends being the corners (of FLAME as far as the
+    landmark embedding goes). albedo: [D, 3] u8 sRGB of a painted neutral skin. sha256: of the geometry. skeleton: of a
+    head that turns its jaw and neck by joints, which then turn the eyes too; None for one that moves the jaw by
+    expressions. signed: expression weights are standard deviations of either sign and names mean nothing.
     """
 
     name: str

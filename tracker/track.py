@@ -85,11 +85,12 @@ class Track:
     """The fitted face of one clip. Head frame: x to the subject's left, y up, z out of the face, metres.
 
     X_camera = R(rotation) X_head + translation, camera frame OpenCV (x right, y down, z forward).
-    time: [T] s. valid: [T] bool. confidence: [T] 0..1. identity: [Ki]. expression: [T, Ke].
-    jaw, neck: [T, 3] axis-angle rad. eyes: [T, 2, 3] axis-angle rad, left then right.
-    rotation: [T, 3] axis-angle rad. translation: [T, 3] m. focal px. principal: [2] px. size: (width, height).
-    head: `name@sha256` of the head model. lip_gap_mm: [T]. reprojection_px: [T], mean over landmarks.
-    Rows of invalid frames are finite and tell nothing: the nearest good pose, or another tracker's own.
+    time: [T] s. valid: [T] bool. confidence: [T] 0..1. identity: [Ki]. expression: [T, Ke]. jaw, neck: [T, 3]
+    axis-angle rad. eyes: [T, 2, 3] axis-angle rad, left then right. rotation: [T, 3] axis-angle rad. translation: [T,
+    3] m. focal px. principal: [2] px. distortion: [0..3] radial coefficients, see `Camera`. size: (width, height).
+    head: `name@sha256` of the head model. lip_gap_mm: [T]. reprojection_px: [T], mean over landmarks, from where they
+    lie without distortion; refined, inner lips' as the colours have them. Rows of invalid frames are finite and tell
+    nothing: the nearest good pose, or another tracker's own.
     """
 
     time: F64
