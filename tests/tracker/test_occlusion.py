@@ -146,6 +146,13 @@ def test_what_covers_the_lips_all_the_time_is_told_by_its_colour(cover, low: boo
     assert seen.unlike_lips.min() > UNLIKE_LIPS_HALF
 
 
+def test_what_covers_the_lips_for_most_of_the_clip_is_not_its_pattern():
+    bare, covered = tinted(), tinted((38, 36, 36))
+    seen = look(*clip(spoil=lambda frame, picture: (bare if frame < 12 else covered)(frame, picture)))
+    assert seen.strangeness[:12].max() < 0.08 and seen.unlike_lips[:12].max() < 0.05
+    assert seen.strangeness[12:].min() > 0.2 and seen.unlike_lips[12:].min() > UNLIKE_LIPS_HALF
+
+
 @pytest.mark.parametrize("light", [1.0, 0.2, BLUE_LIGHT, TWO_LIGHTS])
 def test_lips_are_as_red_as_skin_in_any_light(light):
     assert look(*clip(spoil=tinted(light=light))).unlike_lips.max() < 0.05
