@@ -8,6 +8,7 @@ told by lips that are not red.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -113,7 +114,10 @@ class FaceWatch:
             inside = np.stack(self._inside)[seen]
             outside[seen] = 1 - inside[:, list(LIPS)].mean(1)
             typical = np.median(place, axis=0).astype(np.float64)
-            unlike_lips[seen] = _unlike_lips(colour, inside, typical[:, 0] < typical[NOSE_BRIDGE, 0])
+            right = typical[:, 0] < typical[NOSE_BRIDGE, 0]
+            unlike_lips[seen] = np.concatenate(
+                [_unlike_lips(colour[p], inside[p], right) for p in _parts(len(seen))]
+            )
             with_lips = np.flatnonzero(unlike_lips[seen] <= LIPLESS)
             teaching = with_lips if len(with_lips) else np.arange(len(seen))
             # Without all of the mouth a face may look as strange as it does.
@@ -192,11 +196,17 @@ def _strangeness(colour: U8, inside: Bool, teaching: NDArray[np.intp]) -> F64:
         mean = values[taken].mean(0)
         patterns = np.linalg.svd(values[taken] - mean, full_matrices=False)[2]
         patterns = patterns[: min(PATTERNS, len(taken) // FRAMES_PER_PATTERN)]
-    # Some at a time: of all frames of an hour these would fill gigabytes.
-    parts = (slice(start, start + LEARNED) for start in range(0, len(colour), LEARNED))
     return np.concatenate(
-        [_unlike(_contrasts(colour[p], inside[p], usual), told[p], mean, patterns) for p in parts]
+        [
+            _unlike(_contrasts(colour[p], inside[p], usual), told[p], mean, patterns)
+            for p in _parts(len(colour))
+        ]
     )
+
+
+def _parts(total: int) -> Iterator[slice]:
+    """Some frames at a time: all of an hour's in floating point would fill gigabytes."""
+    return (slice(start, start + LEARNED) for start in range(0, total, LEARNED))
 
 
 def _logs(colour: U8) -> F64:
