@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tracker.face_detector import INPUT_SIZE, Face, anchors, decode, letterbox, merge, overlaps, tiles
+from tracker.face_detector import (
+    INPUT_SIZE,
+    Face,
+    FaceDetector,
+    anchors,
+    decode,
+    letterbox,
+    merge,
+    overlaps,
+    tiles,
+)
 from tracker.head import HeadModel, load_head
 from tracker.landmark_indices import (
     BLENDSHAPE_INPUT,
@@ -65,6 +75,21 @@ def test_overlapping_detections_become_their_weighted_mean() -> None:
     first, second = merge(points, np.array([0.6, 0.9, 0.7], np.float32))
     assert first[0][0, 0] == pytest.approx(0.8) and first[1] == pytest.approx(0.9)
     assert second[0][2, 0] == pytest.approx(50)
+
+
+def test_faces_are_merged_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Means of detections may overlap though these did not: in the whole picture they are faces of their own."""
+    boxes = np.float32([[0, 0, 60, 60], [12, 0, 72, 60]])
+    near = [Face(box, np.zeros((6, 2), np.float32), score) for box, score in zip(boxes, (0.9, 0.8))]
+    seen = {"whole": near, "tile": []}
+    monkeypatch.setattr(
+        FaceDetector, "_detect_in", lambda self, rgb, _: list(seen["whole" if len(rgb) == 100 else "tile"])
+    )
+    detector, picture = object.__new__(FaceDetector), np.zeros((100, 100, 3), np.uint8)
+    assert detector.detect(picture, tiled=True) == near
+    seen["whole"], seen["tile"] = [], near
+    (face,) = detector.detect(picture, tiled=True)  # the same two, seen in several tiles
+    assert face.score == np.float32(0.9)
 
 
 @pytest.mark.parametrize("size", [(1920, 1080), (1080, 1920), (360, 288), (50, 50), (1000, 3)])
