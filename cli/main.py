@@ -36,6 +36,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "demo": demo,
 }
+BEGIN_ANEW = ("animate", "edit")  # after an interruption; the others continue
 INPUT_ERROR, BUG, INTERRUPTED = 2, 1, 130
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's share of it, the largest file
 # A place that the user named and that cannot be read or written.
@@ -132,7 +133,8 @@ def main() -> None:
             )
             code = BUG
     if code == INTERRUPTED:  # typer's own exit code for it, too
-        typer.echo("personalize: interrupted; run the same command again to continue", err=True)
+        outcome = "begin anew" if arguments[0] in BEGIN_ANEW else "continue"
+        typer.echo(f"personalize: interrupted; run the same command again to {outcome}", err=True)
     sys.exit(code or 0)
 
 

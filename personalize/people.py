@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.face_detector import Face, merged
+from tracker.face_detector import Face, around, merged
 from tracker.landmarker import FaceLandmarker, roi_from_face
 from tracker.similarity import similarity
 
@@ -136,19 +136,17 @@ class FaceFollower:
 
     def _find(self, time: float, rgb: U8) -> list[Face]:
         faces = self._landmarker.detect(rgb)
-        if not faces:
-            # The surroundings of two may show the same face.
-            faces = merged(f for t in self._open for f in self._find_near(t.sightings[-1].box, rgb))
+        # One too small for the whole picture is missed there, or seen at a wrong size, or beside another.
+        boxes = [t.sightings[-1].box for t in self._open]
+        missed = [box for box in boxes if all(_overlap(box, face.box) < MIN_OVERLAP for face in faces)]
+        # The surroundings of two may show the same face.
+        faces = apart(
+            merged([*faces, *(face for box in missed for face in self._landmarker.detect(rgb, near=box))])
+        )
         if not faces and time >= self._next_search:
             self._next_search = time + SEARCH_S
             faces = self._landmarker.detect(rgb, tiled=True)
         return faces
-
-    def _find_near(self, box: F32, rgb: U8) -> list[Face]:
-        """Faces in the surroundings of a box: one too small for the whole picture is seen there."""
-        part, offset = around(rgb, box)
-        found = self._landmarker.detect(part)
-        return [Face(f.box + np.tile(offset, 2), f.keypoints + offset, f.score) for f in found]
 
     def _sample(self, tracklet: Tracklet, time: float, face: Face, rgb: U8) -> tuple[F32, U8] | None:
         if time < tracklet.next_sample:
@@ -158,12 +156,19 @@ class FaceFollower:
         return (points, _portrait(rgb, points)) if presence >= MIN_PRESENCE else None
 
 
-def around(rgb: U8, box: F32) -> tuple[U8, F32]:
-    """The surroundings of a face's box, three times as large, and their left top corner [2] px in the picture."""
-    side = 1.5 * max(box[2] - box[0], box[3] - box[1])
-    x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
-    left, top = max(0, int(x - side)), max(0, int(y - side))
-    return rgb[top : int(y + side) + 1, left : int(x + side) + 1], np.array([left, top], np.float32)
+def apart(faces: list[Face]) -> list[Face]:
+    """Faces, best score first, without any that holds the middle of a surer one, or has its own in that one's box."""
+    kept: list[Face] = []
+    for face in faces:
+        if not any(_holds(face.box, other.box) or _holds(other.box, face.box) for other in kept):
+            kept.append(face)
+    return kept
+
+
+def _holds(box: F32, other: F32) -> bool:
+    """Whether the middle of `other` lies in `box`, both [4] px."""
+    middle = (other[:2] + other[2:]) / 2
+    return bool((middle > box[:2]).all() and (middle < box[2:]).all())
 
 
 def sureness_of_turns(landmarker: FaceLandmarker, rgb: U8, box: F32) -> F64:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from personalize.people import around
+from tracker.face_detector import around
 
 REASONS = (
     "ok",

@@ -51,7 +51,7 @@ def speech_model_assets(settings: Settings) -> dict[str, str]:
 class Ingest(Stage):
     """Video -> times, usable frames and why not, sound, split."""
 
-    name, version, needs = "ingest", 13, (VIDEO,)
+    name, version, needs = "ingest", 14, (VIDEO,)
     makes = ("media.json", "frames.npz", "audio.wav", "split.json")
 
     def make(self, context: Context, folder: Path) -> None:
@@ -71,7 +71,7 @@ class Ingest(Stage):
 class LandmarkStage(Stage):
     """478 points and 52 scores on every frame that shows the face, what covers or blurs it, and rigid features."""
 
-    name, version = "landmarks", 11
+    name, version = "landmarks", 12
     needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz", "features.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Face detection: BlazeFace short range on the whole picture, or on overlapping tiles for small faces."""
+"""Face detection: BlazeFace short range on the whole picture, or on parts of it for small faces."""
 
 from __future__ import annotations
 
@@ -121,6 +121,14 @@ def tiles(width: int, height: int, divisor: int) -> Iterator[tuple[int, int, int
             yield int(left), int(top), side
 
 
+def around(rgb: NDArray[np.uint8], box: F32) -> tuple[NDArray[np.uint8], tuple[int, int]]:
+    """The surroundings of a face's box [4] px, three times as large, and their (left, top) corner in the picture."""
+    side = 1.5 * max(box[2] - box[0], box[3] - box[1])
+    x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
+    left, top = max(0, int(x - side)), max(0, int(y - side))
+    return rgb[top : int(y + side) + 1, left : int(x + side) + 1], (left, top)
+
+
 class FaceDetector:
     """The detection network with its anchors."""
 
@@ -132,8 +140,14 @@ class FaceDetector:
         self._regressors, self._logits = outputs[(1, 896, 16)], outputs[(1, 896, 1)]
         self._anchors = anchors()
 
-    def detect(self, rgb: NDArray[np.uint8], tiled: bool = False) -> list[Face]:
-        """Faces in rgb [H, W, 3], best score first; `tiled`: if there is none, search ever smaller tiles."""
+    def detect(self, rgb: NDArray[np.uint8], tiled: bool = False, near: F32 | None = None) -> list[Face]:
+        """Faces in rgb [H, W, 3], best score first; `tiled`: if there is none, search ever smaller tiles.
+
+        near: [4] px, a box in whose surroundings alone they are looked for.
+        """
+        if near is not None:
+            part, (left, top) = around(rgb, near)
+            return self._detect_in(part, (left, top)) if part.size else []
         height, width = rgb.shape[:2]
         found = self._detect_in(rgb, (0, 0))
         for divisor in TILE_DIVISORS if tiled else ():

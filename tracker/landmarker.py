@@ -139,9 +139,9 @@ class FaceLandmarker:
         self._beside = ThreadPoolExecutor(1)  # for the mirror image, on another processor where there is one
         self._blendshapes = _Network(blendshapes, threads)
 
-    def detect(self, rgb: NDArray[np.uint8], tiled: bool = False) -> list[Face]:
-        """Faces in rgb [H, W, 3] u8, best score first; `tiled`: if the whole shows none, search tiles."""
-        return self._detector.detect(rgb, tiled)
+    def detect(self, rgb: NDArray[np.uint8], tiled: bool = False, near: F32 | None = None) -> list[Face]:
+        """Faces in rgb [H, W, 3] u8, best score first; see `FaceDetector.detect`."""
+        return self._detector.detect(rgb, tiled, near)
 
     def landmarks(self, rgb: NDArray[np.uint8], roi: Roi) -> tuple[F32, float, F32]:
         """Landmarks of the face in one region of rgb [H, W, 3] u8.
@@ -230,10 +230,12 @@ class LandmarkTracker:
 
     def _search(self, rgb: NDArray[np.uint8], box: F32 | None) -> tuple[F32, float, F32] | None:
         self._roi = None
-        faces = self._landmarker.detect(rgb, tiled=self._frames_without % SEARCH_INTERVAL == 0)
-        self._frames_without += 1
-        if box is not None:
+        if box is None:
+            faces = self._landmarker.detect(rgb, tiled=self._frames_without % SEARCH_INTERVAL == 0)
+        else:  # the whole picture may show it at a wrong size, or another face alone
+            faces = self._landmarker.detect(rgb, near=box)
             faces = [face for face in faces if _inside((face.box[:2] + face.box[2:]) / 2, box)]
+        self._frames_without += 1
         for face in sorted(faces, key=lambda f: f.box[0] - f.box[2]):
             points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
             if presence < MIN_PRESENCE:

@@ -111,10 +111,18 @@ def test_an_encoder_a_device_a_focal_length_or_a_mode_that_is_not_there_gets_one
 
 
 @pytest.mark.parametrize(
-    "error", [AttributeError("no _multiarray_umath"), UserError("wav2vec2 cannot be read")]
+    ("error", "asked", "to_do"),
+    [
+        (AttributeError("no _multiarray_umath"), ["talk.mp4"], "continue"),
+        (UserError("wav2vec2 cannot be read"), ["animate", "speech.wav"], "begin anew"),
+    ],
 )
 def test_an_interruption_that_a_module_makes_another_error_of_is_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: Exception,
+    asked: list[str],
+    to_do: str,
 ) -> None:
     def importing(*_: object, **__: object) -> None:
         try:
@@ -125,14 +133,14 @@ def test_an_interruption_that_a_module_makes_another_error_of_is_one(
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setattr(cli.main, "app", importing)
-    monkeypatch.setattr(sys, "argv", ["personalize", "talk.mp4"])
+    monkeypatch.setattr(sys, "argv", ["personalize", *asked])
     try:
         with pytest.raises(SystemExit) as stopped:
             cli.main.main()
     finally:
         signal.signal(signal.SIGINT, before)
     assert stopped.value.code == 130
-    assert capsys.readouterr().err == "personalize: interrupted; run the same command again to continue\n"
+    assert capsys.readouterr().err == f"personalize: interrupted; run the same command again to {to_do}\n"
 
 
 @pytest.mark.parametrize(

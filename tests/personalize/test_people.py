@@ -68,22 +68,33 @@ def test_how_much_of_a_face_is_cut_off_is_measured() -> None:
     assert follower.tracklets[0].sightings[0].burnt == pytest.approx(1 / 3, abs=0.02)
 
 
-def test_small_faces_that_are_found_near_each_other_are_followed_once_each() -> None:
-    boxes = np.float32([[100, 100, 130, 130], [140, 100, 170, 130]])
-    down, right = np.mgrid[:256, :256].astype(np.uint8)
-    picture = np.stack([right, down, down], axis=-1)  # each pixel says where it is
+def follow(whole: list[Face], parts: list[Face], from_picture: int) -> list[Tracklet]:
+    """12 pictures that show `parts` near a face and in tiles; as a whole first nothing, and then `whole`."""
 
-    def detect(rgb: np.ndarray, tiled: bool = False) -> list[Face]:
-        """Both faces, but in the whole picture only where tiles are searched."""
-        if rgb.shape == picture.shape and not tiled:
-            return []
-        corner = np.tile(rgb[0, 0, :2].astype(np.float32), 2)
-        return [Face(box - corner, np.zeros((6, 2), np.float32), 0.9) for box in boxes]
+    def detect(rgb: np.ndarray, tiled: bool = False, near: np.ndarray | None = None) -> list[Face]:
+        return parts if tiled or near is not None else whole if index >= from_picture else []
 
     follower = FaceFollower(Mock(detect=detect, landmarks=lambda *_: (np.zeros((478, 3)), 0.0, None)))
     for index in range(12):
-        follower.add(index, index / 25, picture)
-    assert [len(tracklet.frames) for tracklet in follower.tracklets] == [12, 12]
+        follower.add(index, index / 25, np.zeros((256, 256, 3), np.uint8))
+    return follower.tracklets
+
+
+def face(*box: float, score: float = 0.9) -> Face:
+    return Face(np.float32(box), np.zeros((6, 2), np.float32), score)
+
+
+def test_small_faces_that_are_found_near_each_other_are_followed_once_each() -> None:
+    followed = follow([], [face(100, 100, 130, 130), face(140, 100, 170, 130)], 12)
+    assert [len(tracklet.frames) for tracklet in followed] == [12, 12]
+
+
+def test_a_small_face_is_followed_while_the_whole_picture_shows_another() -> None:
+    small, bust = face(200, 60, 230, 90), face(185, 40, 250, 105, score=0.55)
+    (followed,) = follow([bust], [small], 2)
+    assert followed.frames == list(range(12)) and followed.sightings[-1].box.tolist() == small.box.tolist()
+    followed, other = follow([face(20, 40, 140, 160)], [small], 2)
+    assert followed.frames == list(range(12)) and other.frames == list(range(2, 12))
 
 
 def test_behind_a_cut_a_face_is_looked_at_anew_however_shortly_it_is_seen() -> None:

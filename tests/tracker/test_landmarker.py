@@ -224,6 +224,20 @@ def test_small_faces_need_tiles(head: HeadModel, landmarker: FaceLandmarker) -> 
     assert 1500 < face.box[0] < face.box[2] < 1610 and 300 < face.keypoints[2, 1] < 410
 
 
+def test_a_small_face_that_is_meant_is_found_beside_a_large_one(
+    head: HeadModel, landmarker: FaceLandmarker
+) -> None:
+    """As that of somebody who shows slides with a picture of a face."""
+    picture, _ = _picture(head)
+    wide = np.full((1080, 1920, 3), 90, np.uint8)
+    wide[300:410, 1500:1610] = cv2.resize(picture, (110, 110), interpolation=cv2.INTER_AREA)
+    wide[100:900, 200:1000] = cv2.resize(picture, (800, 800))
+    assert [face.box[0] < 1000 for face in landmarker.detect(wide, tiled=True)] == [True]
+    found = LandmarkTracker(landmarker).next(wide, np.float32([1530, 320, 1580, 400]))
+    assert found is not None and 1500 < found[0][:, 0].min() < found[0][:, 0].max() < 1610
+    assert landmarker.detect(wide, near=np.float32([2500, 320, 2550, 370])) == []
+
+
 def test_a_clip_loses_and_finds_the_face(head: HeadModel) -> None:
     left, right = (_picture(head, x)[0] for x in (-0.05, 0.05))
     empty = np.full_like(left, 80)
@@ -274,7 +288,7 @@ class _Crowd:
         self.tiled: list[bool] = []
         self.regions: list[Roi] = []
 
-    def detect(self, rgb: np.ndarray, tiled: bool = False) -> list[Face]:
+    def detect(self, rgb: np.ndarray, tiled: bool = False, near: np.ndarray | None = None) -> list[Face]:
         self.tiled.append(tiled)
         return [self._face(*one) for one in self.faces]
 
