@@ -67,7 +67,7 @@ MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it fo
 DESCRIPTIONS = {
     "no_face": "no face is seen",
     "cut": "cuts and shots too short to track",
-    "other_person": "another person's face, or something covers it",
+    "other_person": "another person's face or a photograph's, or something covers it",
     "too_small": "the face is too small",
     "too_dark": "the face is too dark",
     "too_bright": "the face is overexposed",

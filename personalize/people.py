@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 
 import cv2
@@ -24,7 +26,11 @@ MIN_OVERLAP = 0.3  # intersection over union of a face's boxes from one picture 
 MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
 SAMPLE_S = 0.6  # time between two looks at the face's shape
 MIN_PRESENCE = 0.5  # of the landmarker: what it does not take for a face is none, whatever the detector says
-SEARCH_S = 1.0  # between searches for small faces in tiles while none is seen
+SEARCH_S = 1.0  # between searches for small faces in tiles while none is seen, or pictures of faces alone
+# Landmarks of a face that differ by less (of norm 1, median) at so many looks or more are those of a picture of one:
+# photographs in film come to .0005, people who listen to .005 in any two seconds.
+STILL, STILL_LOOKS = 0.001, 4
+HEAD_MARGIN = 0.5  # of a face's width and height, to each side: what a head with its hair takes
 PORTRAIT = (12, 14)  # px, width and height of the grey picture that people are told apart by
 # Between 20 people (GRID and four more, 3 s each) a threshold of 2 takes 1 % of pairs for the same person and
 # no pair of one person's shots for two.
@@ -58,10 +64,20 @@ class Sighting:
 
 @dataclass(eq=False)
 class Tracklet:
-    """One face followed from picture to picture."""
+    """One face followed from picture to picture.
+
+    latest: the landmarks of its last samples. still: by these it is the picture of a face.
+    """
 
     sightings: list[Sighting]
     next_sample: float = -1.0
+    latest: deque[F32] = field(default_factory=lambda: deque(maxlen=STILL_LOOKS))
+    still: bool = False
+
+    @property
+    def box(self) -> F32:
+        """[4] px, where it was last seen."""
+        return self.sightings[-1].box
 
     @property
     def frames(self) -> list[int]:
@@ -103,12 +119,13 @@ class FaceFollower:
         """Look at the next picture [H, W, 3]. sudden: there may be a cut before it, and every face another one."""
         if sudden:
             for followed in self._open:
-                followed.next_sample = time
+                followed.next_sample, followed.still = time, False
+                followed.latest.clear()
         self._open = [t for t in self._open if time - t.sightings[-1].time <= MAX_LOST_S]
         waiting = list(self._open)
         for face in self._find(time, rgb):
-            tracklet = max(waiting, key=lambda t: _overlap(t.sightings[-1].box, face.box), default=None)
-            if tracklet is None or _overlap(tracklet.sightings[-1].box, face.box) < MIN_OVERLAP:
+            tracklet = max(waiting, key=lambda t: _overlap(t.box, face.box), default=None)
+            if tracklet is None or _overlap(tracklet.box, face.box) < MIN_OVERLAP:
                 tracklet = Tracklet([])
                 self.tracklets.append(tracklet)
                 self._open.append(tracklet)
@@ -130,22 +147,25 @@ class FaceFollower:
 
     @property
     def widest(self) -> F32 | None:
-        """[4] px, box of the widest face that is being followed, where it was last seen."""
-        boxes = [tracklet.sightings[-1].box for tracklet in self._open]
+        """[4] px, box of the widest face that is being followed, where it was last seen; of pictures only if alone."""
+        boxes = [t.box for t in self._open if not t.still] or [t.box for t in self._open]
         return max(boxes, key=lambda box: float(box[2] - box[0]), default=None)
 
     def _find(self, time: float, rgb: U8) -> list[Face]:
         faces = self._landmarker.detect(rgb)
         # One too small for the whole picture is missed there, or seen at a wrong size, or beside another.
-        boxes = [t.sightings[-1].box for t in self._open]
-        missed = [box for box in boxes if all(_overlap(box, face.box) < MIN_OVERLAP for face in faces)]
+        missed = [
+            t for t in self._open if not any(_overlap(t.box, face.box) >= MIN_OVERLAP for face in faces)
+        ]
         # The surroundings of two may show the same face.
-        faces = apart(
-            merged([*faces, *(face for box in missed for face in self._landmarker.detect(rgb, near=box))])
-        )
-        if not faces and time >= self._next_search:
+        near = [face for t in missed for face in self._landmarker.detect(rgb, near=t.box)]
+        faces = apart(merged([*faces, *near]))
+        still = [t.box for t in self._open if t.still]
+        alone = all(any(_overlap(box, face.box) >= MIN_OVERLAP for box in still) for face in faces)
+        if alone and time >= self._next_search:
             self._next_search = time + SEARCH_S
-            faces = self._landmarker.detect(rgb, tiled=True)
+            found = self._landmarker.detect(_without(rgb, faces), tiled=True)
+            faces = apart([*faces, *found])
         return faces
 
     def _sample(self, tracklet: Tracklet, time: float, face: Face, rgb: U8) -> tuple[F32, U8] | None:
@@ -153,7 +173,11 @@ class FaceFollower:
             return None
         tracklet.next_sample = time + SAMPLE_S
         points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
-        return (points, _portrait(rgb, points)) if presence >= MIN_PRESENCE else None
+        if presence < MIN_PRESENCE:
+            return None
+        tracklet.latest.append(points)
+        tracklet.still = is_picture(tracklet.latest)
+        return points, _portrait(rgb, points)
 
 
 def apart(faces: list[Face]) -> list[Face]:
@@ -163,6 +187,17 @@ def apart(faces: list[Face]) -> list[Face]:
         if not any(_holds(face.box, other.box) or _holds(other.box, face.box) for other in kept):
             kept.append(face)
     return kept
+
+
+def _without(rgb: U8, faces: list[Face]) -> U8:
+    """The picture [H, W, 3] with the heads of faces painted over."""
+    out = rgb.copy() if faces else rgb
+    for face in faces:
+        margin = HEAD_MARGIN * (face.box[2:] - face.box[:2])
+        left, top = np.maximum(face.box[:2] - margin, 0).astype(int)
+        right, bottom = np.maximum(face.box[2:] + margin, 0).astype(int)
+        out[top:bottom, left:right] = 0
+    return out
 
 
 def _holds(box: F32, other: F32) -> bool:
@@ -223,6 +258,14 @@ def align(shapes: F64, reference: F64) -> F64:
     return shapes @ rotation.transpose(0, 2, 1)
 
 
+def is_picture(shapes: Sequence[F32]) -> bool:
+    """Whether landmarks [478, 3] of a face at several times never move, as those of a photograph on a slide."""
+    if len(shapes) < STILL_LOOKS:
+        return False
+    aligned = align(np.asarray(shapes, np.float64), np.asarray(shapes[0], np.float64))
+    return float(np.median(np.linalg.norm(aligned - np.median(aligned, axis=0), axis=(1, 2)))) < STILL
+
+
 @dataclass(frozen=True)
 class Look:
     """How one person looks: median landmarks [478, 3] of norm 1 in one pose, median PORTRAIT of norm 1."""
@@ -245,11 +288,15 @@ class Look:
 
 
 def main_person(tracklets: list[Tracklet]) -> tuple[list[Tracklet], list[Tracklet]]:
-    """(tracklets of the person who is most in the picture, those of others). What is no face is in neither."""
+    """(tracklets of the person who is most in the picture, those of others). What is no face is in neither.
+
+    A picture of a face is another person, unless there is nothing else.
+    """
     faces = [t for t in tracklets if t.shapes]
+    people = [t for t in faces if not is_picture(t.shapes)] or faces
     best: list[Tracklet] = []
-    for seed in sorted(faces, key=lambda t: -t.weight)[:SEEDS]:
-        same = _same_person(seed, faces)
+    for seed in sorted(people, key=lambda t: -t.weight)[:SEEDS]:
+        same = _same_person(seed, people)
         # The one found first, in the largest tracklet, unless another is clearly more in the picture.
         if sum(t.weight for t in same) > 1.05 * sum(t.weight for t in best):
             best = same

@@ -29,16 +29,22 @@ def tracklet(
     seed: int = 0,
     light: float = 120.0,
     burnt: float = 0.0,
+    moves: float = 0.01,
 ) -> Tracklet:
     """A face whose shape and portrait are those of `person`, with some noise and in another pose."""
     own, noise = np.random.default_rng(person), np.random.default_rng(seed + 1000)
     shape = np.random.default_rng(99).normal(size=(478, 3)) + 0.15 * own.normal(size=(478, 3))
     portrait = own.integers(0, 255, (14, 12))
-    sample = (
-        (100 * (shape + 0.01 * noise.normal(size=shape.shape)) + 7).astype(np.float32),
-        (0.7 * portrait + noise.integers(0, 20, portrait.shape)).astype(np.uint8),
-    )
+
+    def sample() -> tuple[np.ndarray, np.ndarray]:
+        points = 100 * (shape + moves * noise.normal(size=shape.shape)) + 7
+        grey = 0.7 * portrait + noise.integers(0, 20, portrait.shape)
+        return points.astype(np.float32), grey.astype(np.uint8)
+
     box = np.array([0, 0, width, width], np.float32)
     return Tracklet(
-        [Sighting(f, f / 25, box.copy(), 60.0, light, burnt, 0.5, None if f % 10 else sample) for f in frames]
+        [
+            Sighting(f, f / 25, box.copy(), 60.0, light, burnt, 0.5, None if f % 10 else sample())
+            for f in frames
+        ]
     )

@@ -20,6 +20,7 @@ from personalize.people import (
 )
 from tests.personalize.people_factory import tracklet
 from tracker.face_detector import Face
+from tracker.landmarker import Roi
 
 
 def test_the_person_most_in_the_picture_is_kept_over_cuts() -> None:
@@ -81,7 +82,8 @@ def follow(whole: list[Face], parts: list[Face], from_picture: int) -> list[Trac
 
 
 def face(*box: float, score: float = 0.9) -> Face:
-    return Face(np.float32(box), np.zeros((6, 2), np.float32), score)
+    eyes = np.float32([[0.7 * box[0] + 0.3 * box[2], box[1]], [0.3 * box[0] + 0.7 * box[2], box[1]]])
+    return Face(np.float32(box), np.concatenate([eyes, np.zeros((4, 2), np.float32)]), score)
 
 
 def test_small_faces_that_are_found_near_each_other_are_followed_once_each() -> None:
@@ -95,6 +97,38 @@ def test_a_small_face_is_followed_while_the_whole_picture_shows_another() -> Non
     assert followed.frames == list(range(12)) and followed.sightings[-1].box.tolist() == small.box.tolist()
     followed, other = follow([face(20, 40, 140, 160)], [small], 2)
     assert followed.frames == list(range(12)) and other.frames == list(range(2, 12))
+
+
+def test_a_photograph_is_nobody_unless_there_is_nobody_else() -> None:
+    photograph, mine = tracklet(1, range(0, 90), width=300, moves=0.0), tracklet(2, range(20, 90), width=60)
+    assert main_person([photograph, mine]) == ([mine], [photograph])
+    assert main_person([photograph]) == ([photograph], [])
+    shortly = tracklet(1, range(0, 30), width=300, moves=0.0)  # three looks tell nothing yet
+    assert main_person([shortly, mine]) == ([shortly], [mine])
+
+
+def test_somebody_small_beside_a_photograph_is_looked_for() -> None:
+    """As the speaker beside a slide: the photograph is found first, and hides them from the search in tiles."""
+    photograph, speaker = face(20, 20, 120, 120), face(200, 200, 220, 220)
+    shape, moving = np.random.default_rng(0).normal(size=(2, 478, 3))
+    picture = np.full((256, 256, 3), 90, np.uint8)
+
+    def detect(rgb: np.ndarray, tiled: bool = False, near: np.ndarray | None = None) -> list[Face]:
+        if near is not None:
+            return [photograph] if near[0] < 100 else [speaker]
+        return [speaker] if tiled and not rgb[10:130, 10:130].any() else [photograph]
+
+    def landmarks(rgb: np.ndarray, roi: Roi) -> tuple[np.ndarray, float, None]:
+        share = 0.02 * index / 25 if roi.x > 150 else 0.0
+        return (100 * (shape + share * moving)).astype(np.float32), 0.9, None
+
+    follower = FaceFollower(Mock(detect=detect, landmarks=landmarks))
+    for index in range(100):
+        follower.add(index, index / 25, picture)
+    still, small = follower.tracklets
+    assert len(still.frames) == 100 and 40 <= small.frames[0] <= 80 and small.frames[-1] == 99
+    assert picture.min() == 90 and follower.widest is not None
+    assert follower.widest.tolist() == speaker.box.tolist()
 
 
 def test_behind_a_cut_a_face_is_looked_at_anew_however_shortly_it_is_seen() -> None:
