@@ -231,12 +231,13 @@ class LandmarkTracker:
     def _search(self, rgb: NDArray[np.uint8], box: F32 | None) -> tuple[F32, float, F32] | None:
         self._roi = None
         search = box is None and self._frames_without % SEARCH_INTERVAL == 0
-        faces = self._landmarker.detect(rgb, tiled=search)
+        self._frames_without += 1
+        faces = _widest_first(self._landmarker.detect(rgb, tiled=search))
         if box is not None:
             # One too small for the whole picture is missed there, or seen at a wrong size, or beside another.
-            faces = _within(box, faces) or _within(box, self._landmarker.detect(rgb, near=box))
-        self._frames_without += 1
-        for face in sorted(faces, key=lambda f: f.box[0] - f.box[2]):
+            faces += _widest_first(self._landmarker.detect(rgb, near=box))
+            faces = [face for face in faces if _inside((face.box[:2] + face.box[2:]) / 2, box)]
+        for face in faces:
             points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
             if presence < MIN_PRESENCE:
                 continue
@@ -249,9 +250,8 @@ class LandmarkTracker:
         return None
 
 
-def _within(box: F32, faces: list[Face]) -> list[Face]:
-    """Those of the faces whose middles lie in a box [4] left, top, right, bottom."""
-    return [face for face in faces if _inside((face.box[:2] + face.box[2:]) / 2, box)]
+def _widest_first(faces: list[Face]) -> list[Face]:
+    return sorted(faces, key=lambda face: face.box[0] - face.box[2])
 
 
 def _inside(point: NDArray[np.floating], box: F32) -> bool:
