@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from personalize.container import MediaInfo, probe, quantizer
+from personalize.dissolves import Dissolves
 from personalize.errors import UserError
 from personalize.people import FaceFollower, Tracklet, main_person, sureness_of_turns
 from personalize.pictures import FrameReader
@@ -29,6 +30,7 @@ from personalize.shots import (
     Changes,
     Frames,
     find_shots,
+    parted,
     repeated,
     sudden,
     usable_seconds,
@@ -66,7 +68,7 @@ MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it fo
 
 DESCRIPTIONS = {
     "no_face": "no face is seen",
-    "cut": "cuts and shots too short to track",
+    "cut": "cuts, dissolves, and shots too short to track",
     "other_person": "another person's face or a photograph's, or something covers it",
     "too_small": "the face is too small",
     "too_dark": "the face is too dark",
@@ -142,7 +144,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     looked = _looked_through(media, progress)
     time, again = looked.time, looked.again
     _check_rate(media, time[~again])
-    segment = find_shots(time, looked.change)
+    segment = parted(find_shots(time, looked.change), looked.fading)
     mine, others = main_person([shot for face in looked.faces for shot in face.shots(segment)])
     _check_upright(media, mine, looked.turns)
     total = len(time)
@@ -163,7 +165,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
         "too_dark": seen & (light < MIN_LIGHT),
         "too_bright": seen & (burnt > MAX_BURNT),
         "too_small": seen & (eyes < MIN_EYES_PX),
-        "cut": seen & _cut(time, segment),
+        "cut": looked.fading | (seen & _cut(time, segment)),
         "duplicate": again & seen,
         "corrupt": looked.corrupt,
     }
@@ -212,12 +214,14 @@ def _check_upright(media: MediaInfo, person: list[Tracklet], turns: list[F64]) -
 class _Seen:
     """What one pass over the pictures shows.
 
-    time: [T] s. change: [T], how much each differs from the last. again: [T] repeated. corrupt: [T] damaged. faces:
-    all, in px of pictures of at most SEARCH_SIDE. turns: `sureness_of_turns` of some. reader: at its end.
+    time: [T] s. change: [T], how much each differs from the last. fading: [T] in a dissolve. again: [T] repeated.
+    corrupt: [T] damaged. faces: all, in px of pictures of at most SEARCH_SIDE. turns: `sureness_of_turns` of some.
+    reader: at its end.
     """
 
     time: F64
     change: F64
+    fading: Bool
     again: Bool
     corrupt: Bool
     faces: list[Tracklet]
@@ -230,9 +234,11 @@ def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
     reader, follower = FrameReader(media.path, SEARCH_SIDE), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
     recent = deque[float](maxlen=min(max(3, round(CUT_WINDOW_S * media.fps)), MOST_WINDOW))
-    changes, rows, turns, next_look = Changes(), [], list[F64](), 0.0
+    changes, dissolves = Changes(), Dissolves(media.fps)
+    rows, turns, next_look = [], list[F64](), 0.0
     for index, (time, rgb) in enumerate(reader):
         whole, near = changes.next(rgb, follower.widest)
+        dissolves.add(changes.thumbnail)
         rows.append((time, whole, near, reader.damaged))
         gap = len(rows) > 1 and time - rows[-2][0] > MAX_GAP_S
         follower.add(index, time, rgb, gap or sudden(near[0], recent))
@@ -253,7 +259,9 @@ def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
     of_repeats = near_views if usual < NEARLY_SMALL * SMALL_FACE else whole_views
     at, differences = np.array(times), np.array([change for change, _ in of_cuts])
     again = repeated(at, *(np.array(column) for column in zip(*of_repeats)))
-    return _Seen(at, differences, again, np.array(damaged), follower.tracklets, turns, reader)
+    return _Seen(
+        at, differences, dissolves.found, again, np.array(damaged), follower.tracklets, turns, reader
+    )
 
 
 def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:

@@ -86,6 +86,12 @@ class Changes:
     def __init__(self) -> None:
         self._last: tuple[U8, F32] | None = None
 
+    @property
+    def thumbnail(self) -> F32:
+        """Of the last picture, see `thumbnail`."""
+        assert self._last is not None, "before any picture"
+        return self._last[1]
+
     def next(self, rgb: U8, face: F32 | None) -> tuple[tuple[float, bool], tuple[float, bool]]:
         """See `difference`: of the whole, and of that or what surrounds a face, whichever is more.
 
@@ -141,6 +147,12 @@ def find_shots(time: F64, change: F64) -> NDArray[np.int32]:
     first = (step > MAX_GAP_S) | ((rate > CUT_LEVEL) & (rate > CUT_RATIO * usual))
     first[0] = True
     return (np.cumsum(first) - 1).astype(np.int32)
+
+
+def parted(segment: NDArray[np.int32], fading: Bool) -> NDArray[np.int32]:
+    """Shots [T] as `find_shots` numbers them, with each of the dissolves `fading` [T] as one of its own."""
+    first = (np.diff(segment, prepend=segment[0]) != 0) | np.diff(fading, prepend=fading[0])
+    return np.cumsum(first).astype(np.int32)
 
 
 def _usual_step(time: F64) -> float:
