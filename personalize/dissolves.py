@@ -20,12 +20,9 @@ Bool = NDArray[np.bool_]
 APART_S = (0.12, 0.2, 0.32)  # from a picture to those that it is compared with, before and behind it
 FASTEST = 240.0  # pictures a second; broken time stamps may say any number
 LASTS_S, LASTS = 0.2, 4  # what so many pictures in a row do not show is none
-CHANGED = 6.0  # grey levels by which a pixel changes beyond the light's change of all
-LEAST_CHANGED, LEVEL, NOT_LIGHT = (
-    0.2,
-    8.0,
-    0.5,
-)  # share of such pixels; their mean change; its share of all change
+# Grey levels by which pixels change beyond the change of the light of all; the least share of pixels that change by
+# more than the first, their least mean, and the least share that it has in all change.
+CHANGED, LEAST_CHANGED, LEVEL, NOT_LIGHT = 6.0, 0.2, 8.0, 0.5
 HALFWAY, SPREAD = 0.2, 0.08  # how far pixels are from the middle of their way (median), and from each other
 
 

@@ -154,18 +154,16 @@ class FaceFollower:
     def _find(self, time: float, rgb: U8) -> list[Face]:
         faces = self._landmarker.detect(rgb)
         # One too small for the whole picture is missed there, or seen at a wrong size, or beside another.
-        missed = [
-            t for t in self._open if not any(_overlap(t.box, face.box) >= MIN_OVERLAP for face in faces)
-        ]
+        seen = [face.box for face in faces]
+        missed = [followed.box for followed in self._open if not _meets(followed.box, seen)]
         # The surroundings of two may show the same face.
-        near = [face for t in missed for face in self._landmarker.detect(rgb, near=t.box)]
-        faces = apart(merged([*faces, *near]))
-        still = [t.box for t in self._open if t.still]
-        alone = all(any(_overlap(box, face.box) >= MIN_OVERLAP for box in still) for face in faces)
-        if alone and time >= self._next_search:
+        faces = apart(
+            merged([*faces, *(f for box in missed for f in self._landmarker.detect(rgb, near=box))])
+        )
+        still = [followed.box for followed in self._open if followed.still]
+        if time >= self._next_search and all(_meets(face.box, still) for face in faces):
             self._next_search = time + SEARCH_S
-            found = self._landmarker.detect(_without(rgb, faces), tiled=True)
-            faces = apart([*faces, *found])
+            faces = apart([*faces, *self._landmarker.detect(_without(rgb, faces), tiled=True)])
         return faces
 
     def _sample(self, tracklet: Tracklet, time: float, face: Face, rgb: U8) -> tuple[F32, U8] | None:
@@ -181,7 +179,7 @@ class FaceFollower:
 
 
 def apart(faces: list[Face]) -> list[Face]:
-    """Faces, best score first, without any that holds the middle of a surer one, or has its own in that one's box."""
+    """Faces, surest first, without any that holds the middle of one before it, or has its own in that one's box."""
     kept: list[Face] = []
     for face in faces:
         if not any(_holds(face.box, other.box) or _holds(other.box, face.box) for other in kept):
@@ -248,6 +246,11 @@ def _overlap(a: F32, b: F32) -> float:
     sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
     shared = float(np.prod(np.maximum(sides, 0)))
     return shared / max(float(np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2])) - shared, 1e-9)
+
+
+def _meets(box: F32, others: list[F32]) -> bool:
+    """Whether a box is another place of one of the others' faces."""
+    return any(_overlap(box, other) >= MIN_OVERLAP for other in others)
 
 
 def align(shapes: F64, reference: F64) -> F64:
