@@ -26,7 +26,7 @@ MIN_OVERLAP = 0.3  # intersection over union of a face's boxes from one picture 
 MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
 SAMPLE_S = 0.6  # time between two looks at the face's shape
 MIN_PRESENCE = 0.5  # of the landmarker: what it does not take for a face is none, whatever the detector says
-SEARCH_S = 1.0  # between searches for small faces in tiles while none is seen, or pictures of faces alone
+SEARCH_S, SELDOM_S = 1.0, 3.0  # between searches for small faces in tiles: while none is seen, while some are
 # Landmarks of a face that differ by less (of norm 1, median) at so many looks or more are those of a picture of one:
 # photographs in film come to .0005, people who listen to .005 in any two seconds.
 STILL, STILL_LOOKS = 0.001, 4
@@ -35,7 +35,7 @@ PORTRAIT = (12, 14)  # px, width and height of the grey picture that people are 
 # Between 20 people (GRID and four more, 3 s each) a threshold of 2 takes 1 % of pairs for the same person and
 # no pair of one person's shots for two.
 SHAPE_SCALE, PORTRAIT_SCALE, OTHER_PERSON = 0.05, 0.25, 2.0
-SEEDS = 5  # largest tracklets tried as the main person
+MOST_PEOPLE = 10  # are tried as the main person, those with the largest tracklets
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class FaceFollower:
     def __init__(self, landmarker: FaceLandmarker) -> None:
         self._landmarker = landmarker
         self._open: list[Tracklet] = []
-        self._next_search = -1.0
+        self._searched = -np.inf
         self.tracklets: list[Tracklet] = []
 
     def add(self, index: int, time: float, rgb: U8, sudden: bool = False) -> None:
@@ -160,9 +160,8 @@ class FaceFollower:
         faces = apart(
             merged([*faces, *(f for box in missed for f in self._landmarker.detect(rgb, near=box))])
         )
-        still = [followed.box for followed in self._open if followed.still]
-        if time >= self._next_search and all(_meets(face.box, still) for face in faces):
-            self._next_search = time + SEARCH_S
+        if time - self._searched >= (SELDOM_S if faces else SEARCH_S):
+            self._searched = time
             faces = apart([*faces, *self._landmarker.detect(_without(rgb, faces), tiled=True)])
         return faces
 
@@ -298,11 +297,16 @@ def main_person(tracklets: list[Tracklet]) -> tuple[list[Tracklet], list[Trackle
     faces = [t for t in tracklets if t.shapes]
     people = [t for t in faces if not is_picture(t.shapes)] or faces
     best: list[Tracklet] = []
-    for seed in sorted(people, key=lambda t: -t.weight)[:SEEDS]:
-        same = _same_person(seed, people)
+    rest = sorted(people, key=lambda t: -t.weight)
+    for _ in range(MOST_PEOPLE):
+        if not rest:
+            break
+        same = _same_person(rest[0], people)
         # The one found first, in the largest tracklet, unless another is clearly more in the picture.
         if sum(t.weight for t in same) > 1.05 * sum(t.weight for t in best):
             best = same
+        theirs = {id(t) for t in [rest[0], *same]}
+        rest = [t for t in rest if id(t) not in theirs]
     mine = {id(t) for t in best}
     return best, [t for t in faces if id(t) not in mine]
 
