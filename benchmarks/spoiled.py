@@ -1,11 +1,12 @@
 """How a clip is tracked when its film is spoiled, and whether that is told: `python -m benchmarks spoiled VIDEO ...`.
 
 The first seconds of a video are written anew as they are, and spoiled: compressed, in other light, with noise, out of
-focus, without colours, shaken, and with things pasted over the mouth. Each goes through the command up to `judge`.
+focus, without colours, shaken, with things pasted over the mouth, faded into a nearer shot, and small in a wide
+picture. Each goes through the command up to `judge`.
 
 used            frames that are used by default, %
-bare out        of those that nothing covers or shakes, which are left out; %
-covered used    of those in which the mouth is covered all the way, or which are shaken as far, which are used; %
+bare out        of those that nothing covers, shakes or fades, which are left out; %
+covered used    of those in which the mouth is covered all the way, which are shaken as far, or fade, which are used; %
 rmse, bias, r   lip opening of the other used frames against the copy that is not spoiled, mm
 warnings        how each begins
 """
@@ -17,8 +18,9 @@ import subprocess
 import sys
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import cv2
@@ -32,9 +34,10 @@ from personalize.run import read_landmarks, read_track
 from personalize.sound import on_video_clock, read_audio
 from personalize.video_writer import VideoWriter
 from tracker.landmark_indices import LEFT_EYE_OUTER, LIPS, POINTS, RIGHT_EYE_OUTER
-from tracker.track import F32
+from tracker.track import F32, F64
 
 U8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
 Picture = Callable[[U8, F32], U8]  # of a picture [H, W, 3] and its landmarks [478, 2] px
 
 SECONDS = 13.0
@@ -42,6 +45,8 @@ GAMMA = 2.2
 FOREHEAD = 151
 DARK = (28, 25, 25)
 WARNED = 36  # characters
+WIDE = (1920, 1080)  # px
+INSET = 2.6  # times the distance between the eyes: half of what is seen around a small face
 BELOW = 1.3  # of the distance between the eyes: how far under the mouth a cover comes from
 
 
@@ -57,6 +62,10 @@ class Spell(ABC):
         """0..1, 1 where it is there altogether."""
         inside = (min(time - t, t + 2 * self.ramp + self.hold - time) / self.ramp for t in self.times)
         return float(np.clip(max(inside), 0, 1))
+
+    def parts(self, near: F64) -> tuple[Bool, Bool]:
+        """[T] each: the frames that it spares, and those that it spoils altogether; near: [T], of `near`."""
+        return near == 0, near == 1
 
     @abstractmethod
     def over(self, rgb: U8, points: F32, near: float) -> U8:
@@ -108,6 +117,60 @@ class Cover(Spell):
         return out
 
 
+@dataclass(frozen=True)
+class Faded(Spell):
+    """The shot fades into another, so many times closer, and back."""
+
+    closer: float = 1.25
+
+    def parts(self, near: F64) -> tuple[Bool, Bool]:
+        """Between two shots all is spoiled."""
+        between = (near > 0) & (near < 1)
+        return ~between, between
+
+    def over(self, rgb: U8, points: F32, near: float) -> U8:
+        """The two shots on top of each other."""
+        height, width = rgb.shape[:2]
+        middle = ((width - 1) / 2, (height - 1) / 2)
+        closer = cv2.warpAffine(rgb, cv2.getRotationMatrix2D(middle, 0, self.closer), (width, height))
+        return np.asarray(cv2.addWeighted(rgb, 1 - near, closer, near, 0), np.uint8)
+
+
+class Small:
+    """The head, small in the corner of a wide picture: amid its own blurred enlargement, or a slide with a photograph.
+
+    eyes: px between them. photograph: the film's first picture with a face.
+    """
+
+    def __init__(self, eyes: float, photograph: bool) -> None:
+        self._eyes, self._with_photograph = eyes, photograph
+        self._first: tuple[U8, F64] | None = None
+
+    def __call__(self, rgb: U8, points: F32) -> U8:
+        """The wide picture, blank until a face is seen."""
+        if self._first is None:
+            if not np.isfinite(points).all():
+                return np.zeros((WIDE[1], WIDE[0], 3), np.uint8)
+            self._first = rgb, self._inset(points)
+        still, place = self._first
+        scale = WIDE[1] / rgb.shape[0]
+        if self._with_photograph:
+            out = np.full((WIDE[1], WIDE[0], 3), 245, np.uint8)
+            large = cv2.resize(still, None, fx=scale, fy=scale)[:, : WIDE[0] // 2]
+            out[:, : large.shape[1]] = large
+        else:
+            out = cv2.GaussianBlur(cv2.resize(rgb, WIDE), (0, 0), 12)
+        side = round(2 * INSET * self._eyes)
+        out[-side:, -side:] = cv2.warpAffine(rgb, place, (side, side), flags=cv2.INTER_AREA)
+        return np.asarray(out, np.uint8)
+
+    def _inset(self, points: F32) -> F64:
+        """[2, 3] from px of the film to those of what is seen of it."""
+        eyes = points[[RIGHT_EYE_OUTER, LEFT_EYE_OUTER]].astype(np.float64)
+        scale = self._eyes / np.linalg.norm(eyes[1] - eyes[0])
+        return np.column_stack([scale * np.eye(2), INSET * self._eyes - scale * eyes.mean(0)])
+
+
 def _around(rgb: U8, place: F32, wide: float, high: float) -> U8:
     """A rectangle of the picture, at least a pixel large."""
     reach = np.array([wide, high])
@@ -151,23 +214,29 @@ def grey(rgb: U8, _: F32) -> U8:
     return np.repeat(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=2)
 
 
-# Name -> what is done to each picture, x264's crf.
 WHOLE = "as it is"
-SPOILED: dict[str, tuple[Picture | Spell, int]] = {
-    WHOLE: (as_it_is, 12),
-    "crf 30": (as_it_is, 30),
-    "crf 36": (as_it_is, 36),
-    "three times the light": (lit(3), 18),
-    "a tenth of the light": (lit(0.1), 18),
-    "noise": (noisy(30), 18),
-    "out of focus": (blurred(0.021), 18),
-    "no colours": (grey, 18),
-    "a hand, four times": (Cover((1.5, 4.5, 7.5, 10.0), 0.3, 0.7), 18),
-    "half a hand, slowly": (Cover((3.0,), 2.0, 2.0, wide=0.55, aside=0.28), 18),
-    "shaken, four times": (Shaken((1.5, 4.5, 7.5, 10.0), 0.1, 0.3), 18),
-    "a ball, for 5.5 s": (Cover((1.0,), 0.5, 5.5, skin=False, wide=0.56, aside=-0.1), 18),
-    "a ball, from 1 s on": (Cover((1.0,), 0.3, SECONDS, skin=False, wide=0.56, aside=-0.1), 18),
-}
+
+
+def ways() -> dict[str, tuple[Picture | Spell, int]]:
+    """Name -> what is done to each picture, x264's crf. For one video: some remember its first picture."""
+    return {
+        WHOLE: (as_it_is, 12),
+        "crf 30": (as_it_is, 30),
+        "crf 36": (as_it_is, 36),
+        "three times the light": (lit(3), 18),
+        "a tenth of the light": (lit(0.1), 18),
+        "noise": (noisy(30), 18),
+        "out of focus": (blurred(0.021), 18),
+        "no colours": (grey, 18),
+        "a hand, four times": (Cover((1.5, 4.5, 7.5, 10.0), 0.3, 0.7), 18),
+        "half a hand, slowly": (Cover((3.0,), 2.0, 2.0, wide=0.55, aside=0.28), 18),
+        "shaken, four times": (Shaken((1.5, 4.5, 7.5, 10.0), 0.1, 0.3), 18),
+        "a ball, for 5.5 s": (Cover((1.0,), 0.5, 5.5, skin=False, wide=0.56, aside=-0.1), 18),
+        "a ball, from 1 s on": (Cover((1.0,), 0.3, SECONDS, skin=False, wide=0.56, aside=-0.1), 18),
+        "fading, twice and back": (Faded((2.0, 7.0), 0.6, 1.9), 18),
+        "small amid its blur": (Small(62, photograph=False), 18),
+        "beside a photograph": (Small(75, photograph=True), 18),
+    }
 
 
 def write_spoiled(video: Path, out: Path, way: Picture | Spell, crf: int, points: F32) -> None:
@@ -175,13 +244,20 @@ def write_spoiled(video: Path, out: Path, way: Picture | Spell, crf: int, points
     info = probe(video)
     sound = on_video_clock(*read_audio(video), SECONDS)
     none = np.full((POINTS, 2), np.nan, np.float32)
-    with VideoWriter(out, info.fps, (info.width, info.height), sound, crf=crf) as writer:
+
+    def pictures() -> Iterator[tuple[float, U8]]:
         for frame, (time, rgb) in enumerate(FrameReader(video)):
             if time >= SECONDS:
-                break
+                return
             marks = points[frame] if frame < len(points) else none
-            changed = way.over(rgb, marks, way.near(time)) if isinstance(way, Spell) else way(rgb, marks)
-            writer.write(changed, time)
+            yield time, way.over(rgb, marks, way.near(time)) if isinstance(way, Spell) else way(rgb, marks)
+
+    changed = pictures()
+    first = next(changed)
+    height, width = first[1].shape[:2]
+    with VideoWriter(out, info.fps, (width, height), sound, crf=crf) as writer:
+        for time, rgb in chain([first], changed):
+            writer.write(rgb, time)
 
 
 def opening_errors(run: Path, whole: Path, spell: Spell | None) -> list[float]:
@@ -189,7 +265,7 @@ def opening_errors(run: Path, whole: Path, spell: Spell | None) -> list[float]:
     track, right = (read_track(folder / "refine/track.npz") for folder in (run, whole))
     used = read_reasons(run / "refine/quality.csv") == "ok"
     near = np.array([spell.near(time) if spell else 0.0 for time in track.time])
-    bare, covered = near == 0, near == 1
+    bare, covered = spell.parts(near) if spell else (near == 0, near == 1)
     known = used & bare & np.isin(np.round(track.time, 3), np.round(right.time[right.valid], 3))
     found, true = track.lip_gap_mm[known], np.interp(track.time[known], right.time, right.lip_gap_mm)
     error = (found - true).astype(np.float64)
@@ -219,7 +295,7 @@ def main() -> None:
 def spoil(video: Path, folder: Path) -> None:
     """All ways, in a folder for films and runs."""
     points, whole = np.zeros((0, POINTS, 2), np.float32), folder / f"{WHOLE}.run"
-    for name, (way, crf) in SPOILED.items():
+    for name, (way, crf) in ways().items():
         film, run = folder / f"{name}.mp4", folder / f"{name}.run"
         write_spoiled(video, film, way, crf, points)
         command = [sys.executable, "-m", "cli.main", "run", str(film), "--out", str(run), "--until", "judge"]

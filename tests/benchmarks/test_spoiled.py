@@ -6,7 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.spoiled import SPOILED, Cover, Shaken, blurred, lit, noisy, opening_errors, write_spoiled
+from benchmarks.spoiled import (
+    Cover,
+    Faded,
+    Shaken,
+    Small,
+    blurred,
+    lit,
+    noisy,
+    opening_errors,
+    ways,
+    write_spoiled,
+)
 from personalize.pictures import FrameReader
 from personalize.run import write_track
 from tests.personalize.test_registration import track_of
@@ -52,6 +63,34 @@ def test_a_shaken_picture_is_smeared_along_its_rows(points: np.ndarray) -> None:
     assert shaken.over(edge, points, 0.0) is edge
 
 
+def test_a_shot_fades_into_a_nearer_one(points: np.ndarray) -> None:
+    rgb = np.zeros((101, 201, 3), np.uint8)
+    rgb[:, 100:] = 200
+    rgb[40:61, 90:111] = 255
+    faded = Faded((1.0,), 0.5, 1.0, closer=2.0)
+    assert (faded.over(rgb, points, 0.0) == rgb).all()
+    closer = faded.over(rgb, points, 1.0)
+    assert (closer[32:69, 82:119] == 255).all() and not closer[:, :75].any()
+    np.testing.assert_allclose(faded.over(rgb, points, 0.5), (rgb / 2 + closer / 2), atol=1)
+    spared, spoiled = faded.parts(np.array([0.0, 0.1, 0.9, 1.0]))
+    assert spared.tolist() == [True, False, False, True] and (spoiled == ~spared).all()
+
+
+@pytest.mark.parametrize("photograph", [False, True])
+def test_a_small_head_lies_in_the_corner(points: np.ndarray, photograph: bool) -> None:
+    """Of 40 px between the eyes, half of the film's: 208 px wide and high, the eyes' middle in its middle."""
+    rgb = np.full((200, 240, 3), 100, np.uint8)
+    rgb[45:56, 115:126] = 255
+    small = Small(EYES_PX / 2, photograph)
+    assert not small(rgb, np.full_like(points, np.nan)).any()
+    out, other = small(rgb, points), small(np.zeros_like(rgb), points + 30)
+    assert out.shape == other.shape == (1080, 1920, 3)
+    row, column = np.argwhere(out[-208:, -208:, 0] > 200).mean(0)
+    assert (row, column) == pytest.approx((104, 104), abs=1)
+    # The photograph stays, its own blur does not, and the window does not follow the head.
+    assert (out[500, 300] == other[500, 300]).all() == photograph and not other[-208 + 60, -104].any()
+
+
 def test_light_noise_and_focus(points: np.ndarray) -> None:
     flat = np.full((60, 60, 3), 100, np.uint8)
     # Three times the light in gamma 2.2 is 3 ** (1 / 2.2) times the level.
@@ -70,7 +109,7 @@ def test_a_film_is_written_again_at_its_times(tmp_path: Path, points: np.ndarray
     times = [0.0, 0.04, 0.12, 0.2]
     pictures = [np.full((64, 96, 3), 60 + 40 * k, np.uint8) for k in range(4)]
     path = write_video(tmp_path / "v.mp4", pictures, times)
-    way, crf = SPOILED["as it is"]
+    way, crf = ways()["as it is"]
     write_spoiled(path, tmp_path / "out.mp4", way, crf, points[None])
     again = list(FrameReader(tmp_path / "out.mp4"))
     assert [time for time, _ in again] == pytest.approx(times, abs=1e-3)
