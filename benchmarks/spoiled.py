@@ -1,12 +1,12 @@
 """How a clip is tracked when its film is spoiled, and whether that is told: `python -m benchmarks spoiled VIDEO ...`.
 
 The first seconds of a video are written anew as they are, and spoiled: compressed, in other light, with noise, out of
-focus, without colours, shaken, with things pasted over the mouth, faded into a nearer shot, and small in a wide
-picture. Each goes through the command up to `judge`.
+focus, without colours, shaken, with things pasted over the mouth, and small in a wide picture. Each goes through the
+command up to `judge`.
 
 used            frames that are used by default, %
-bare out        of those that nothing covers, shakes or fades, which are left out; %
-covered used    of those in which the mouth is covered all the way, which are shaken as far, or fade, which are used; %
+bare out        of those that nothing covers or shakes, which are left out; %
+covered used    of those in which the mouth is covered all the way, or which are shaken as far, which are used; %
 rmse, bias, r   lip opening of the other used frames against the copy that is not spoiled, mm
 warnings        how each begins
 """
@@ -37,7 +37,6 @@ from tracker.landmark_indices import LEFT_EYE_OUTER, LIPS, POINTS, RIGHT_EYE_OUT
 from tracker.track import F32, F64
 
 U8 = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
 Picture = Callable[[U8, F32], U8]  # of a picture [H, W, 3] and its landmarks [478, 2] px
 
 SECONDS = 13.0
@@ -62,10 +61,6 @@ class Spell(ABC):
         """0..1, 1 where it is there altogether."""
         inside = (min(time - t, t + 2 * self.ramp + self.hold - time) / self.ramp for t in self.times)
         return float(np.clip(max(inside), 0, 1))
-
-    def parts(self, near: F64) -> tuple[Bool, Bool]:
-        """[T] each: the frames that it spares, and those that it spoils altogether; near: [T], of `near`."""
-        return near == 0, near == 1
 
     @abstractmethod
     def over(self, rgb: U8, points: F32, near: float) -> U8:
@@ -117,25 +112,6 @@ class Cover(Spell):
         return out
 
 
-@dataclass(frozen=True)
-class Faded(Spell):
-    """The shot fades into another, so many times closer, and back."""
-
-    closer: float = 1.25
-
-    def parts(self, near: F64) -> tuple[Bool, Bool]:
-        """Between two shots all is spoiled."""
-        between = (near > 0) & (near < 1)
-        return ~between, between
-
-    def over(self, rgb: U8, points: F32, near: float) -> U8:
-        """The two shots on top of each other."""
-        height, width = rgb.shape[:2]
-        middle = ((width - 1) / 2, (height - 1) / 2)
-        closer = cv2.warpAffine(rgb, cv2.getRotationMatrix2D(middle, 0, self.closer), (width, height))
-        return np.asarray(cv2.addWeighted(rgb, 1 - near, closer, near, 0), np.uint8)
-
-
 class Small:
     """The head, small in the corner of a wide picture: amid its own blurred enlargement, or a slide with a photograph.
 
@@ -161,7 +137,8 @@ class Small:
         else:
             out = cv2.GaussianBlur(cv2.resize(rgb, WIDE), (0, 0), 12)
         side = round(2 * INSET * self._eyes)
-        out[-side:, -side:] = cv2.warpAffine(rgb, place, (side, side), flags=cv2.INTER_AREA)
+        blurred = cv2.GaussianBlur(rgb, (0, 0), max(0.5 / place[0, 0] - 0.5, 0.01))
+        out[-side:, -side:] = cv2.warpAffine(blurred, place, (side, side), flags=cv2.INTER_LINEAR)
         return np.asarray(out, np.uint8)
 
     def _inset(self, points: F32) -> F64:
@@ -233,7 +210,6 @@ def ways() -> dict[str, tuple[Picture | Spell, int]]:
         "shaken, four times": (Shaken((1.5, 4.5, 7.5, 10.0), 0.1, 0.3), 18),
         "a ball, for 5.5 s": (Cover((1.0,), 0.5, 5.5, skin=False, wide=0.56, aside=-0.1), 18),
         "a ball, from 1 s on": (Cover((1.0,), 0.3, SECONDS, skin=False, wide=0.56, aside=-0.1), 18),
-        "fading, twice and back": (Faded((2.0, 7.0), 0.6, 1.9), 18),
         "small amid its blur": (Small(62, photograph=False), 18),
         "beside a photograph": (Small(75, photograph=True), 18),
     }
@@ -265,7 +241,7 @@ def opening_errors(run: Path, whole: Path, spell: Spell | None) -> list[float]:
     track, right = (read_track(folder / "refine/track.npz") for folder in (run, whole))
     used = read_reasons(run / "refine/quality.csv") == "ok"
     near = np.array([spell.near(time) if spell else 0.0 for time in track.time])
-    bare, covered = spell.parts(near) if spell else (near == 0, near == 1)
+    bare, covered = near == 0, near == 1
     known = used & bare & np.isin(np.round(track.time, 3), np.round(right.time[right.valid], 3))
     found, true = track.lip_gap_mm[known], np.interp(track.time[known], right.time, right.lip_gap_mm)
     error = (found - true).astype(np.float64)

@@ -133,8 +133,8 @@ def main() -> None:
             )
             code = BUG
     if code == INTERRUPTED:  # typer's own exit code for it, too
-        outcome = "begin anew" if arguments[0] in BEGIN_ANEW else "continue"
-        typer.echo(f"personalize: interrupted; run the same command again to {outcome}", err=True)
+        outcome = ": it begins anew" if arguments[0] in BEGIN_ANEW else " to continue"
+        typer.echo(f"personalize: interrupted; run the same command again{outcome}", err=True)
     sys.exit(code or 0)
 
 

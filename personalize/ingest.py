@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from personalize.container import MediaInfo, probe, quantizer
-from personalize.dissolves import Dissolves
 from personalize.errors import UserError
 from personalize.people import FaceFollower, Tracklet, main_person, sureness_of_turns
 from personalize.pictures import FrameReader
@@ -30,7 +29,6 @@ from personalize.shots import (
     Changes,
     Frames,
     find_shots,
-    parted,
     repeated,
     sudden,
     usable_seconds,
@@ -68,7 +66,7 @@ MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it fo
 
 DESCRIPTIONS = {
     "no_face": "no face is seen",
-    "cut": "cuts, dissolves, and shots too short to track",
+    "cut": "cuts and shots too short to track",
     "other_person": "another person's face or a photograph's, or something covers it",
     "too_small": "the face is too small",
     "too_dark": "the face is too dark",
@@ -144,7 +142,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     looked = _looked_through(media, progress)
     time, again = looked.time, looked.again
     _check_rate(media, time[~again])
-    segment = parted(find_shots(time, looked.change), looked.fading)
+    segment = find_shots(time, looked.change)
     mine, others = main_person([shot for face in looked.faces for shot in face.shots(segment)])
     _check_upright(media, mine, looked.turns)
     total = len(time)
@@ -165,7 +163,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
         "too_dark": seen & (light < MIN_LIGHT),
         "too_bright": seen & (burnt > MAX_BURNT),
         "too_small": seen & (eyes < MIN_EYES_PX),
-        "cut": looked.fading | (seen & _cut(time, segment)),
+        "cut": seen & _cut(time, segment),
         "duplicate": again & seen,
         "corrupt": looked.corrupt,
     }
@@ -214,14 +212,12 @@ def _check_upright(media: MediaInfo, person: list[Tracklet], turns: list[F64]) -
 class _Seen:
     """What one pass over the pictures shows.
 
-    time: [T] s. change: [T], how much each differs from the last. fading: [T] in a dissolve. again: [T] repeated.
-    corrupt: [T] damaged. faces: all, in px of pictures of at most SEARCH_SIDE. turns: `sureness_of_turns` of some.
-    reader: at its end.
+    time: [T] s. change: [T], how much each differs from the last. again: [T] repeated. corrupt: [T] damaged. faces:
+    all, in px of pictures of at most SEARCH_SIDE. turns: `sureness_of_turns` of some. reader: at its end.
     """
 
     time: F64
     change: F64
-    fading: Bool
     again: Bool
     corrupt: Bool
     faces: list[Tracklet]
@@ -234,11 +230,9 @@ def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
     reader, follower = FrameReader(media.path, SEARCH_SIDE), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
     recent = deque[float](maxlen=min(max(3, round(CUT_WINDOW_S * media.fps)), MOST_WINDOW))
-    changes, dissolves = Changes(), Dissolves(media.fps)
-    rows, turns, next_look = [], list[F64](), 0.0
+    changes, rows, turns, next_look = Changes(), [], list[F64](), 0.0
     for index, (time, rgb) in enumerate(reader):
-        whole, near = changes.next(rgb, follower.widest)
-        dissolves.add(changes.thumbnail)
+        whole, near = changes.next(rgb, follower.boxes)
         rows.append((time, whole, near, reader.damaged))
         gap = len(rows) > 1 and time - rows[-2][0] > MAX_GAP_S
         follower.add(index, time, rgb, gap or sudden(near[0], recent))
@@ -250,18 +244,17 @@ def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
             progress(min(len(rows), expected), expected)
     times, whole_views, near_views, damaged = zip(*rows)
     # Once for the clip: two measures side by side would look like motion and rest.
-    widths = np.zeros(len(times))
+    widths: list[list[float]] = [[] for _ in times]
     for sighting in (sighting for face in follower.tracklets for sighting in face.sightings):
-        widths[sighting.frame] = max(widths[sighting.frame], sighting.box[2] - sighting.box[0])
+        widths[sighting.frame].append(float(sighting.box[2] - sighting.box[0]))
     side = min(SEARCH_SIDE, max(media.width, media.height))
-    usual = float(np.median(widths[widths > 0])) / side if widths.any() else np.inf
-    of_cuts = near_views if usual < SMALL_FACE else whole_views
-    of_repeats = near_views if usual < NEARLY_SMALL * SMALL_FACE else whole_views
+    seen = [frame for frame in widths if frame] or [[np.inf]]
+    widest, narrowest = (float(np.median([of(frame) for frame in seen])) / side for of in (max, min))
+    of_cuts = near_views if widest < SMALL_FACE else whole_views
+    of_repeats = near_views if narrowest < NEARLY_SMALL * SMALL_FACE else whole_views
     at, differences = np.array(times), np.array([change for change, _ in of_cuts])
     again = repeated(at, *(np.array(column) for column in zip(*of_repeats)))
-    return _Seen(
-        at, differences, dissolves.found, again, np.array(damaged), follower.tracklets, turns, reader
-    )
+    return _Seen(at, differences, again, np.array(damaged), follower.tracklets, turns, reader)
 
 
 def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:

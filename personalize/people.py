@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.face_detector import Face, around, merged
+from tracker.face_detector import Face, around, holds, merged
 from tracker.landmarker import FaceLandmarker, roi_from_face
 from tracker.similarity import similarity
 
@@ -27,10 +27,9 @@ MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
 SAMPLE_S = 0.6  # time between two looks at the face's shape
 MIN_PRESENCE = 0.5  # of the landmarker: what it does not take for a face is none, whatever the detector says
 SEARCH_S, SELDOM_S = 1.0, 3.0  # between searches for small faces in tiles: while none is seen, while some are
-# Landmarks of a face that differ by less (of norm 1, median) at so many looks or more are those of a picture of one:
-# photographs in film come to .0005, people who listen to .005 in any two seconds.
-STILL, STILL_LOOKS = 0.001, 4
-HEAD_MARGIN = 0.5  # of a face's width and height, to each side: what a head with its hair takes
+# Landmarks of a face that differ by less (of norm 1) in such a share of so many looks or more are a photograph's: in
+# film these come to .0005, people who listen to .005 in any two seconds.
+STILL, STILL_SHARE, STILL_LOOKS = 0.001, 0.75, 4
 PORTRAIT = (12, 14)  # px, width and height of the grey picture that people are told apart by
 # Between 20 people (GRID and four more, 3 s each) a threshold of 2 takes 1 % of pairs for the same person and
 # no pair of one person's shots for two.
@@ -66,7 +65,7 @@ class Sighting:
 class Tracklet:
     """One face followed from picture to picture.
 
-    latest: the landmarks of its last samples. still: by these it is the picture of a face.
+    latest: the landmarks of its last samples. still: by these it is a photograph.
     """
 
     sightings: list[Sighting]
@@ -146,23 +145,27 @@ class FaceFollower:
             tracklet.sightings.append(sighting)
 
     @property
+    def boxes(self) -> list[F32]:
+        """[4] px of each face that is being followed, where it was last seen."""
+        return [followed.box for followed in self._open]
+
+    @property
     def widest(self) -> F32 | None:
-        """[4] px, box of the widest face that is being followed, where it was last seen; of pictures only if alone."""
-        boxes = [t.box for t in self._open if not t.still] or [t.box for t in self._open]
+        """[4] px, where the widest face that is being followed was last seen; a photograph's if there is no other."""
+        boxes = [followed.box for followed in self._open if not followed.still] or self.boxes
         return max(boxes, key=lambda box: float(box[2] - box[0]), default=None)
 
     def _find(self, time: float, rgb: U8) -> list[Face]:
-        faces = self._landmarker.detect(rgb)
+        detector = self._landmarker.detector
+        faces = detector.detect(rgb)
         # One too small for the whole picture is missed there, or seen at a wrong size, or beside another.
         seen = [face.box for face in faces]
-        missed = [followed.box for followed in self._open if not _meets(followed.box, seen)]
+        missed = [box for box in self.boxes if not _meets(box, seen)]
         # The surroundings of two may show the same face.
-        faces = apart(
-            merged([*faces, *(f for box in missed for f in self._landmarker.detect(rgb, near=box))])
-        )
+        faces = apart(merged([*faces, *(face for box in missed for face in detector.detect_near(rgb, box))]))
         if time - self._searched >= (SELDOM_S if faces else SEARCH_S):
             self._searched = time
-            faces = apart([*faces, *self._landmarker.detect(_without(rgb, faces), tiled=True)])
+            faces += detector.search(rgb, besides=[face.box for face in faces])
         return faces
 
     def _sample(self, tracklet: Tracklet, time: float, face: Face, rgb: U8) -> tuple[F32, U8] | None:
@@ -173,7 +176,7 @@ class FaceFollower:
         if presence < MIN_PRESENCE:
             return None
         tracklet.latest.append(points)
-        tracklet.still = is_picture(tracklet.latest)
+        tracklet.still = is_photograph(tracklet.latest)
         return points, _portrait(rgb, points)
 
 
@@ -181,26 +184,9 @@ def apart(faces: list[Face]) -> list[Face]:
     """Faces, surest first, without any that holds the middle of one before it, or has its own in that one's box."""
     kept: list[Face] = []
     for face in faces:
-        if not any(_holds(face.box, other.box) or _holds(other.box, face.box) for other in kept):
+        if not any(holds(face.box, other.box) or holds(other.box, face.box) for other in kept):
             kept.append(face)
     return kept
-
-
-def _without(rgb: U8, faces: list[Face]) -> U8:
-    """The picture [H, W, 3] with the heads of faces painted over."""
-    out = rgb.copy() if faces else rgb
-    for face in faces:
-        margin = HEAD_MARGIN * (face.box[2:] - face.box[:2])
-        left, top = np.maximum(face.box[:2] - margin, 0).astype(int)
-        right, bottom = np.maximum(face.box[2:] + margin, 0).astype(int)
-        out[top:bottom, left:right] = 0
-    return out
-
-
-def _holds(box: F32, other: F32) -> bool:
-    """Whether the middle of `other` lies in `box`, both [4] px."""
-    middle = (other[:2] + other[2:]) / 2
-    return bool((middle > box[:2]).all() and (middle < box[2:]).all())
 
 
 def sureness_of_turns(landmarker: FaceLandmarker, rgb: U8, box: F32) -> F64:
@@ -210,7 +196,9 @@ def sureness_of_turns(landmarker: FaceLandmarker, rgb: U8, box: F32) -> F64:
     """
     part, _ = around(rgb, box)
     pictures = (np.ascontiguousarray(np.rot90(part, quarters)) for quarters in range(4))
-    return np.array([max((face.score for face in landmarker.detect(p)), default=0.0) for p in pictures])
+    return np.array(
+        [max((face.score for face in landmarker.detector.detect(p)), default=0.0) for p in pictures]
+    )
 
 
 def _face_patch(rgb: U8, box: F32) -> U8:
@@ -260,12 +248,13 @@ def align(shapes: F64, reference: F64) -> F64:
     return shapes @ rotation.transpose(0, 2, 1)
 
 
-def is_picture(shapes: Sequence[F32]) -> bool:
-    """Whether landmarks [478, 3] of a face at several times never move, as those of a photograph on a slide."""
+def is_photograph(shapes: Sequence[F32]) -> bool:
+    """Whether landmarks [478, 3] of a face at several times hardly ever move, as those of a photograph on a slide."""
     if len(shapes) < STILL_LOOKS:
         return False
     aligned = align(np.asarray(shapes, np.float64), np.asarray(shapes[0], np.float64))
-    return float(np.median(np.linalg.norm(aligned - np.median(aligned, axis=0), axis=(1, 2)))) < STILL
+    moved = np.linalg.norm(aligned - np.median(aligned, axis=0), axis=(1, 2))
+    return float(np.quantile(moved, STILL_SHARE)) < STILL
 
 
 @dataclass(frozen=True)
@@ -292,10 +281,10 @@ class Look:
 def main_person(tracklets: list[Tracklet]) -> tuple[list[Tracklet], list[Tracklet]]:
     """(tracklets of the person who is most in the picture, those of others). What is no face is in neither.
 
-    A picture of a face is another person, unless there is nothing else.
+    A photograph is another person, unless there is nobody else.
     """
     faces = [t for t in tracklets if t.shapes]
-    people = [t for t in faces if not is_picture(t.shapes)] or faces
+    people = [t for t in faces if not is_photograph(t.shapes)] or faces
     best: list[Tracklet] = []
     rest = sorted(people, key=lambda t: -t.weight)
     for _ in range(MOST_PEOPLE):

@@ -23,8 +23,8 @@ REASONS = (
     "corrupt",
     "duplicate",
 )
-# The usual width of a face, of the picture's long side, below which cuts are told by its surroundings too; and times
-# that, below which repeated pictures are.
+# The usual width of the widest face, of the picture's long side, below which cuts are told by faces' surroundings too;
+# and times that, of the narrowest, below which repeated pictures are.
 SMALL_FACE, NEARLY_SMALL = 0.1, 2.0
 THUMBNAIL = 64  # px, long side of the grey pictures in which cuts and duplicates are looked for
 MAX_GAP_S = 0.25  # a longer time between two pictures ends a shot: nothing is known of what moved there
@@ -86,27 +86,24 @@ class Changes:
     def __init__(self) -> None:
         self._last: tuple[U8, F32] | None = None
 
-    @property
-    def thumbnail(self) -> F32:
-        """Of the last picture, see `thumbnail`."""
-        assert self._last is not None, "before any picture"
-        return self._last[1]
+    def next(self, rgb: U8, faces: Sequence[F32]) -> tuple[tuple[float, bool], tuple[float, bool]]:
+        """See `difference`: of the whole, and of that or what surrounds a small face, whichever is most.
 
-    def next(self, rgb: U8, face: F32 | None) -> tuple[tuple[float, bool], tuple[float, bool]]:
-        """See `difference`: of the whole, and of that or what surrounds a face, whichever is more.
-
-        face: [4] px, its box in the last picture. Where it is small in a picture that stands still, as of somebody who
-        shows their screen, its motion is next to nothing of the whole.
+        faces: [4] px, their boxes in the last picture. Where one is small in a picture that stands still, as of
+        somebody who shows their screen, its motion is next to nothing of the whole.
         """
         grey, before = thumbnail(rgb), self._last
         self._last = rgb, grey
         if before is None:
             return (0.0, False), (0.0, False)
         whole = change, same = difference(grey, before[1])
-        if face is None or face[2] - face[0] >= 1.25 * NEARLY_SMALL * SMALL_FACE * max(rgb.shape):
-            return whole, whole
-        nearby, alike = difference(*(thumbnail(around(picture, face)[0]) for picture in (rgb, before[0])))
-        return whole, (max(change, nearby), same and alike)
+        for face in faces:
+            if face[2] - face[0] < 1.25 * NEARLY_SMALL * SMALL_FACE * max(rgb.shape):
+                nearby, alike = difference(
+                    *(thumbnail(around(picture, face)[0]) for picture in (rgb, before[0]))
+                )
+                change, same = max(change, nearby), same and alike
+        return whole, (change, same)
 
 
 def sudden(change: float, before: Sequence[float]) -> bool:
@@ -147,12 +144,6 @@ def find_shots(time: F64, change: F64) -> NDArray[np.int32]:
     first = (step > MAX_GAP_S) | ((rate > CUT_LEVEL) & (rate > CUT_RATIO * usual))
     first[0] = True
     return (np.cumsum(first) - 1).astype(np.int32)
-
-
-def parted(segment: NDArray[np.int32], fading: Bool) -> NDArray[np.int32]:
-    """Shots [T] as `find_shots` numbers them, with each of the dissolves `fading` [T] as one of its own."""
-    first = (np.diff(segment, prepend=segment[0]) != 0) | np.diff(fading, prepend=fading[0])
-    return np.cumsum(first).astype(np.int32)
 
 
 def _usual_step(time: F64) -> float:

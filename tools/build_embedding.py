@@ -85,7 +85,7 @@ def look(head: HeadModel, count: int, yaws_deg: tuple[float, ...], seed: int) ->
 
 def read(landmarker: FaceLandmarker, picture: NDArray[np.uint8]) -> F32 | None:
     """Landmarks [478, 3] px of the face in a picture, in the region that a film's later frames have; None without."""
-    faces = landmarker.detect(picture)
+    faces = landmarker.detector.detect(picture)
     if not faces:
         return None
     points, _, _ = landmarker.landmarks(picture, roi_from_face(faces[0]))

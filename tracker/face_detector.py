@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,6 +17,7 @@ INPUT_SIZE = 128  # px, side of the network's square input
 MIN_SCORE = 0.5
 MIN_OVERLAP = 0.3  # detections that overlap more (intersection over union) are one face
 TILE_DIVISORS = (2, 3, 5)  # tile side = long side / divisor; the last finds eyes 36 px apart in 1920
+HEAD_MARGIN = 0.5  # of a face's width and height, to each side
 KEYPOINTS = 6  # right eye, left eye, nose tip, mouth, right ear, left ear (the subject's)
 
 
@@ -129,6 +130,18 @@ def around(rgb: NDArray[np.uint8], box: F32) -> tuple[NDArray[np.uint8], tuple[i
     return rgb[top : int(y + side) + 1, left : int(x + side) + 1], (left, top)
 
 
+def holds(box: F32, other: F32) -> bool:
+    """Whether the middle of `other` lies in `box`, both [4] px."""
+    middle = (other[:2] + other[2:]) / 2
+    return bool((middle > box[:2]).all() and (middle < box[2:]).all())
+
+
+def _head(box: F32) -> F32:
+    """[4] px, what the head with its hair takes around the box [4] px of its face."""
+    margin = HEAD_MARGIN * (box[2:] - box[:2])
+    return np.concatenate([box[:2] - margin, box[2:] + margin])
+
+
 class FaceDetector:
     """The detection network with its anchors."""
 
@@ -140,25 +153,34 @@ class FaceDetector:
         self._regressors, self._logits = outputs[(1, 896, 16)], outputs[(1, 896, 1)]
         self._anchors = anchors()
 
-    def detect(self, rgb: NDArray[np.uint8], tiled: bool = False, near: F32 | None = None) -> list[Face]:
-        """Faces in rgb [H, W, 3], best score first; `tiled`: if there is none, search ever smaller tiles.
+    def detect(self, rgb: NDArray[np.uint8]) -> list[Face]:
+        """Faces in rgb [H, W, 3] u8, best score first: those that are no small part of it."""
+        return self._detect_in(rgb, (0, 0))
 
-        near: [4] px, a box in whose surroundings alone they are looked for.
+    def detect_near(self, rgb: NDArray[np.uint8], box: F32) -> list[Face]:
+        """Faces in the surroundings of a box [4] px, best score first."""
+        part, (left, top) = around(rgb, box)
+        return self._detect_in(part, (left, top)) if part.size else []
+
+    def search(self, rgb: NDArray[np.uint8], besides: Sequence[F32] = ()) -> list[Face]:
+        """Faces in ever smaller tiles of rgb [H, W, 3] until there is one, best score first.
+
+        besides: [4] px, boxes of faces that are known: their heads are painted over, and what is found there is none.
         """
-        if near is not None:
-            part, (left, top) = around(rgb, near)
-            return self._detect_in(part, (left, top)) if part.size else []
         height, width = rgb.shape[:2]
-        found = self._detect_in(rgb, (0, 0))
-        for divisor in TILE_DIVISORS if tiled else ():
-            if found:
-                break
+        heads = [_head(box) for box in besides]
+        rgb = rgb.copy() if heads else rgb
+        for left, top, right, bottom in np.maximum(np.round(heads), 0).astype(int).reshape(-1, 4):
+            rgb[top:bottom, left:right] = 0
+        for divisor in TILE_DIVISORS:
             parts = (
                 self._detect_in(rgb[top : top + side, left : left + side], (left, top))
                 for left, top, side in tiles(width, height, divisor)
             )
-            found = merged([face for part in parts for face in part])
-        return found
+            faces = merged(face for part in parts for face in part)
+            if found := [face for face in faces if not any(holds(head, face.box) for head in heads)]:
+                return found
+        return []
 
     def _detect_in(self, rgb: NDArray[np.uint8], offset: tuple[int, int]) -> list[Face]:
         """Faces, in px of the whole picture, in one cut-out at `offset` (left, top)."""

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.face_detector import Face, FaceDetector
+from tracker.face_detector import Face, FaceDetector, holds
 from tracker.halving import halved
 from tracker.landmark_indices import (
     BLENDSHAPE_INPUT,
@@ -132,16 +132,12 @@ class FaceLandmarker:
         """threads: of each network; more than one does not pay on two cores (benchmarks/landmarks.py)."""
         with files("tracker").joinpath("assets/face_landmarker.task").open("rb") as file:
             archive = zipfile.ZipFile(file)
-            self._detector = FaceDetector(archive.read("face_detector.tflite"), threads)
+            self.detector = FaceDetector(archive.read("face_detector.tflite"), threads)
             landmarks = archive.read("face_landmarks_detector.tflite")
             blendshapes = archive.read("face_blendshapes.tflite")
         self._landmarks, self._mirrored = (_Network(landmarks, threads) for _ in range(2))
         self._beside = ThreadPoolExecutor(1)  # for the mirror image, on another processor where there is one
         self._blendshapes = _Network(blendshapes, threads)
-
-    def detect(self, rgb: NDArray[np.uint8], tiled: bool = False, near: F32 | None = None) -> list[Face]:
-        """Faces in rgb [H, W, 3] u8, best score first; see `FaceDetector.detect`."""
-        return self._detector.detect(rgb, tiled, near)
 
     def landmarks(self, rgb: NDArray[np.uint8], roi: Roi) -> tuple[F32, float, F32]:
         """Landmarks of the face in one region of rgb [H, W, 3] u8.
@@ -217,7 +213,7 @@ class LandmarkTracker:
         if (
             self._roi is not None
             and box is not None
-            and not _inside(np.array([self._roi.x, self._roi.y]), box)
+            and not holds(box, np.array([self._roi.x, self._roi.y] * 2, np.float32))
         ):
             self.reset()
         if self._roi is not None:
@@ -230,13 +226,15 @@ class LandmarkTracker:
 
     def _search(self, rgb: NDArray[np.uint8], box: F32 | None) -> tuple[F32, float, F32] | None:
         self._roi = None
-        search = box is None and self._frames_without % SEARCH_INTERVAL == 0
+        detector, due = self._landmarker.detector, self._frames_without % SEARCH_INTERVAL == 0
         self._frames_without += 1
-        faces = _widest_first(self._landmarker.detect(rgb, tiled=search))
+        faces = _widest_first(detector.detect(rgb))
         if box is not None:
             # One too small for the whole picture is missed there, or seen at a wrong size, or beside another.
-            faces += _widest_first(self._landmarker.detect(rgb, near=box))
-            faces = [face for face in faces if _inside((face.box[:2] + face.box[2:]) / 2, box)]
+            faces += _widest_first(detector.detect_near(rgb, box))
+            faces = [face for face in faces if holds(box, face.box)]
+        elif due and not faces:
+            faces = _widest_first(detector.search(rgb))
         for face in faces:
             points, presence, _ = self._landmarker.landmarks(rgb, roi_from_face(face))
             if presence < MIN_PRESENCE:
@@ -252,11 +250,6 @@ class LandmarkTracker:
 
 def _widest_first(faces: list[Face]) -> list[Face]:
     return sorted(faces, key=lambda face: face.box[0] - face.box[2])
-
-
-def _inside(point: NDArray[np.floating], box: F32) -> bool:
-    """Whether a point [2] lies in a box [4] left, top, right, bottom."""
-    return bool((point >= box[:2]).all() and (point <= box[2:]).all())
 
 
 class Watcher(Protocol):

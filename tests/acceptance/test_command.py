@@ -113,8 +113,8 @@ def test_an_encoder_a_device_a_focal_length_or_a_mode_that_is_not_there_gets_one
 @pytest.mark.parametrize(
     ("error", "asked", "to_do"),
     [
-        (AttributeError("no _multiarray_umath"), ["talk.mp4"], "continue"),
-        (UserError("wav2vec2 cannot be read"), ["animate", "speech.wav"], "begin anew"),
+        (AttributeError("no _multiarray_umath"), ["talk.mp4"], " to continue"),
+        (UserError("wav2vec2 cannot be read"), ["animate", "speech.wav"], ": it begins anew"),
     ],
 )
 def test_an_interruption_that_a_module_makes_another_error_of_is_one(
@@ -140,7 +140,7 @@ def test_an_interruption_that_a_module_makes_another_error_of_is_one(
     finally:
         signal.signal(signal.SIGINT, before)
     assert stopped.value.code == 130
-    assert capsys.readouterr().err == f"personalize: interrupted; run the same command again to {to_do}\n"
+    assert capsys.readouterr().err == f"personalize: interrupted; run the same command again{to_do}\n"
 
 
 @pytest.mark.parametrize(

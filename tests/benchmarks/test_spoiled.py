@@ -8,7 +8,6 @@ import pytest
 
 from benchmarks.spoiled import (
     Cover,
-    Faded,
     Shaken,
     Small,
     blurred,
@@ -61,19 +60,6 @@ def test_a_shaken_picture_is_smeared_along_its_rows(points: np.ndarray) -> None:
     assert np.count_nonzero((row > 0) & (row < 200)) == pytest.approx(0.25 * EYES_PX, abs=1)
     np.testing.assert_array_equal(shaken.over(edge.transpose(1, 0, 2), points, 1.0), edge.transpose(1, 0, 2))
     assert shaken.over(edge, points, 0.0) is edge
-
-
-def test_a_shot_fades_into_a_nearer_one(points: np.ndarray) -> None:
-    rgb = np.zeros((101, 201, 3), np.uint8)
-    rgb[:, 100:] = 200
-    rgb[40:61, 90:111] = 255
-    faded = Faded((1.0,), 0.5, 1.0, closer=2.0)
-    assert (faded.over(rgb, points, 0.0) == rgb).all()
-    closer = faded.over(rgb, points, 1.0)
-    assert (closer[32:69, 82:119] == 255).all() and not closer[:, :75].any()
-    np.testing.assert_allclose(faded.over(rgb, points, 0.5), (rgb / 2 + closer / 2), atol=1)
-    spared, spoiled = faded.parts(np.array([0.0, 0.1, 0.9, 1.0]))
-    assert spared.tolist() == [True, False, False, True] and (spoiled == ~spared).all()
 
 
 @pytest.mark.parametrize("photograph", [False, True])

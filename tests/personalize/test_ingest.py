@@ -49,7 +49,7 @@ def follow_one(
     """Let a clip show one face, whose eyes lie `across` [2] px from each other; see FaceFollower for widest."""
     for shape in face.shapes:
         shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + across
-    follower = Mock(tracklets=[face], widest=widest)
+    follower = Mock(tracklets=[face], widest=widest, boxes=[])
     monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: follower)
 
 
@@ -71,9 +71,7 @@ def test_how_closely_is_looked_is_decided_once_for_a_clip(
     looked: list[np.ndarray] = []
     monkeypatch.setattr(
         "personalize.ingest.Changes",
-        lambda: Mock(
-            next=lambda rgb, face: ((1.0, False), (5.0, False)), thumbnail=np.zeros((3, 4), np.float32)
-        ),
+        lambda: Mock(next=lambda rgb, faces: ((1.0, False), (5.0, False))),
     )
     monkeypatch.setattr(
         "personalize.ingest.repeated", lambda time, change, same: looked.append(change) or same
@@ -88,6 +86,12 @@ def test_how_closely_is_looked_is_decided_once_for_a_clip(
         follow_one(monkeypatch, face)
         find_usable(probe(path))
         assert (set(looked.pop()), set(looked.pop())) == ({cuts}, {repeats})
+    # Beside a photograph, which is the widest.
+    face, photograph = tracklet(1, range(60), width=12), tracklet(2, range(60), width=40)
+    follower = Mock(tracklets=[photograph, face], widest=None, boxes=[])
+    monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: follower)
+    find_usable(probe(path))
+    assert (set(looked.pop()), set(looked.pop())) == ({1.0}, {5.0})
 
 
 def test_broken_time_stamps_take_no_more_memory_than_whole_ones() -> None:
@@ -275,7 +279,7 @@ def seen_as(faces: list[Tracklet], time: np.ndarray, **marks: np.ndarray) -> _Se
     """What a pass over pictures at `time` [T] s shows where these faces are; marks: as of `_Seen`."""
     nothing = np.zeros(len(time), bool)
     reader = SimpleNamespace(resized_s=np.nan, interlaced=0)
-    rest = {"change": np.ones(len(time)), "fading": nothing, "again": nothing, "corrupt": nothing} | marks
+    rest = {"change": np.ones(len(time)), "again": nothing, "corrupt": nothing} | marks
     return _Seen(time=time, faces=faces, turns=[], reader=cast(FrameReader, reader), **rest)
 
 
@@ -323,13 +327,6 @@ def test_every_frame_is_left_out_for_its_reason(monkeypatch: pytest.MonkeyPatch)
     assert any("2.0% of 100 frames left out: damaged" in text for text in warnings)  # however few
     assert any("20.0% of 100 frames left out: another person" in text for text in warnings)
     assert not any("repeated" in text for text in warnings)
-
-
-def test_a_dissolve_is_left_out_and_parts_two_shots(monkeypatch: pytest.MonkeyPatch) -> None:
-    fading = np.isin(np.arange(60), range(30, 37))
-    frames, _ = usable_of(seen_as([tracklet(1, range(60))], np.arange(60) / 25, fading=fading), monkeypatch)
-    assert [frames.reasons[index] for index in frames.reason[29:39]] == ["ok", *["cut"] * 8, "ok"]
-    assert np.unique(frames.segment[:30]).tolist() == [0] and np.unique(frames.segment[37:]).tolist() == [2]
 
 
 def test_what_the_detector_missed_for_a_moment_lies_between_its_neighbours(

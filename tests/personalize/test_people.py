@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 from unittest.mock import Mock
 
 import cv2
@@ -14,13 +16,14 @@ from personalize.people import (
     FaceFollower,
     Look,
     Tracklet,
+    apart,
     main_person,
     sharpness,
     sureness_of_turns,
 )
 from tests.personalize.people_factory import tracklet
 from tracker.face_detector import Face
-from tracker.landmarker import Roi
+from tracker.landmarker import FaceLandmarker, Roi
 
 
 def test_the_person_most_in_the_picture_is_kept_over_cuts() -> None:
@@ -40,7 +43,8 @@ def test_somebody_who_is_there_in_every_shot_outweighs_larger_people_who_come_an
     """As before a film that they watch."""
     shots = [range(40 * shot, 40 * shot + 40) for shot in range(8)]
     mine = [tracklet(1, shot, seed=shot.start) for shot in shots]
-    others = [tracklet(2 + shot.start, shot, width=150) for shot in shots]
+    halves = [half for shot in shots for half in (shot[:20], shot[20:])]
+    others = [tracklet(2 + half.start // 40, half, width=150) for half in halves]
     kept, left = main_person([*others, *mine])
     assert {id(t) for t in kept} == {id(t) for t in mine} and {id(t) for t in left} == {id(t) for t in others}
 
@@ -63,7 +67,7 @@ def test_a_face_is_found_most_surely_where_it_is_turned_upright(quarters: int) -
     picture[:20] = 200
     box = np.array([20, 20, 40, 40], np.float32)
     # np.rot90 turns to the left, as the looks do.
-    sure = sureness_of_turns(Mock(detect=detect), np.rot90(picture, -quarters), box)
+    sure = sureness_of_turns(Mock(detector=Mock(detect=detect)), np.rot90(picture, -quarters), box)
     assert sure.argmax() == quarters and np.sort(sure)[:3].tolist() == [0.6] * 3
 
 
@@ -72,22 +76,37 @@ def test_how_much_of_a_face_is_cut_off_is_measured() -> None:
     picture[100:300, 120:280] = 90
     picture[150:225, 120:280] = (255, 252, 120)
     face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
-    landmarker = Mock(detect=lambda rgb, **_: [face], landmarks=lambda *_: (np.zeros((478, 3)), 0.0, None))
-    follower = FaceFollower(landmarker)
+    follower = FaceFollower(cast(FaceLandmarker, Detector([face])))
     follower.add(0, 0.0, picture)
     assert follower.tracklets[0].sightings[0].burnt == pytest.approx(1 / 3, abs=0.02)
 
 
-def follow(whole: list[Face], parts: list[Face], from_picture: int) -> list[Tracklet]:
-    """12 pictures that show `parts` near a face and in tiles; as a whole first nothing, and then `whole`."""
+class Detector:
+    """A landmarker and its detector: the faces that the whole picture shows, parts of it, and tiles; no landmarks."""
 
-    def detect(rgb: np.ndarray, tiled: bool = False, near: np.ndarray | None = None) -> list[Face]:
-        return parts if tiled or near is not None else whole if index >= from_picture else []
+    def __init__(self, whole: list[Face], near: Sequence[Face] = (), tiles: Sequence[Face] = ()) -> None:
+        self.detector, self.whole, self.near, self.tiles = self, whole, list(near), list(tiles)
+        self.searches: list[list[list[float]]] = []
 
-    follower = FaceFollower(Mock(detect=detect, landmarks=lambda *_: (np.zeros((478, 3)), 0.0, None)))
-    for index in range(12):
+    def detect(self, rgb: np.ndarray) -> list[Face]:
+        return self.whole
+
+    def detect_near(self, rgb: np.ndarray, box: np.ndarray) -> list[Face]:
+        return self.near
+
+    def search(self, rgb: np.ndarray, besides: list[np.ndarray]) -> list[Face]:
+        self.searches.append([box.tolist() for box in besides])
+        return self.tiles
+
+    def landmarks(self, rgb: np.ndarray, roi: Roi) -> tuple[np.ndarray, float, None]:
+        return np.zeros((478, 3), np.float32), 0.0, None
+
+
+def follow(detector: Detector, pictures: range, follower: FaceFollower | None = None) -> FaceFollower:
+    follower = follower or FaceFollower(cast(FaceLandmarker, detector))
+    for index in pictures:
         follower.add(index, index / 25, np.zeros((256, 256, 3), np.uint8))
-    return follower.tracklets
+    return follower
 
 
 def face(*box: float, score: float = 0.9) -> Face:
@@ -96,58 +115,91 @@ def face(*box: float, score: float = 0.9) -> Face:
 
 
 def test_small_faces_that_are_found_near_each_other_are_followed_once_each() -> None:
-    followed = follow([], [face(100, 100, 130, 130), face(140, 100, 170, 130)], 12)
+    both = [face(100, 100, 130, 130), face(140, 100, 170, 130)]
+    followed = follow(Detector([], near=both, tiles=both), range(12)).tracklets
     assert [len(tracklet.frames) for tracklet in followed] == [12, 12]
 
 
 def test_a_small_face_is_followed_while_the_whole_picture_shows_another() -> None:
-    small, bust = face(200, 60, 230, 90), face(185, 40, 250, 105, score=0.55)
-    (followed,) = follow([bust], [small], 2)
-    assert followed.frames == list(range(12)) and followed.sightings[-1].box.tolist() == small.box.tolist()
-    followed, other = follow([face(20, 40, 140, 160)], [small], 2)
-    assert followed.frames == list(range(12)) and other.frames == list(range(2, 12))
+    small, bust, large = face(200, 60, 230, 90), face(185, 40, 250, 105, score=0.55), face(20, 40, 140, 160)
+    for whole, tracklets in ((bust, [range(12)]), (large, [range(12), range(2, 12)])):
+        detector = Detector([], near=[small], tiles=[small])
+        follower = follow(detector, range(2))
+        detector.whole = [whole]
+        follow(detector, range(2, 12), follower)
+        assert [followed.frames for followed in follower.tracklets] == [list(frames) for frames in tracklets]
+        assert follower.tracklets[0].box.tolist() == small.box.tolist()
+    assert len(detector.searches) == 1
+
+
+def test_of_faces_within_each_other_the_surest_stays() -> None:
+    sure, around_it, in_a_corner = face(40, 40, 60, 60), face(0, 0, 80, 80), face(56, 56, 58, 58)
+    above_it, beside = face(30, 0, 70, 49), face(70, 40, 90, 60)
+    assert apart([sure, around_it, in_a_corner, beside, above_it]) == [sure, beside, above_it]
+
+
+def test_small_faces_are_searched_for_every_second_and_beside_others_every_three() -> None:
+    large, small = face(20, 40, 140, 160), face(200, 60, 230, 90)
+    detector = Detector([])
+    follower = follow(detector, range(60))
+    assert detector.searches == [[], [], []]
+    detector.whole = [large]
+    follow(detector, range(60, 240), follower)
+    assert detector.searches[3:] == [[large.box.tolist()]] * 2
+    detector.tiles = detector.near = [small]
+    follow(detector, range(240, 330), follower)
+    assert [followed.frames[-1] for followed in follower.tracklets] == [329, 329]
 
 
 def test_a_photograph_is_nobody_unless_there_is_nobody_else() -> None:
     photograph, mine = tracklet(1, range(0, 90), width=300, moves=0.0), tracklet(2, range(20, 90), width=60)
     assert main_person([photograph, mine]) == ([mine], [photograph])
     assert main_person([photograph]) == ([photograph], [])
+    coded = tracklet(1, range(0, 90), width=300, moves=1e-4)
+    assert main_person([coded, mine])[0] == [mine]
+    listens = tracklet(1, range(0, 90), width=300, moves=3e-3)
+    assert main_person([listens, mine])[0] == [listens]
+    frozen = tracklet(1, range(0, 90), width=300)
+    for sighting in frozen.sightings[40:]:  # from then on the picture stands still, as in a call
+        object.__setattr__(sighting, "sample", sighting.sample and frozen.sightings[30].sample)
+    assert main_person([frozen, mine])[0] == [frozen]
     shortly = tracklet(1, range(0, 30), width=300, moves=0.0)  # three looks tell nothing yet
     assert main_person([shortly, mine]) == ([shortly], [mine])
 
 
-def test_somebody_small_beside_a_photograph_is_found() -> None:
-    """As the speaker beside a slide: the photograph hides them from the search in tiles until it is painted over."""
+def test_the_widest_face_is_no_photograph_unless_it_is_alone() -> None:
+    """Nor is what may be another behind a cut."""
     photograph, speaker = face(20, 20, 120, 120), face(200, 200, 220, 220)
     shape, moving = np.random.default_rng(0).normal(size=(2, 478, 3))
-    picture = np.full((256, 256, 3), 90, np.uint8)
-
-    def detect(rgb: np.ndarray, tiled: bool = False, near: np.ndarray | None = None) -> list[Face]:
-        if near is not None:
-            return [photograph] if near[0] < 100 else [speaker]
-        return [speaker] if tiled and not rgb[10:130, 10:130].any() else [photograph]
+    detector = Detector([photograph, speaker])
 
     def landmarks(rgb: np.ndarray, roi: Roi) -> tuple[np.ndarray, float, None]:
-        share = 0.02 * index / 25 if roi.x > 150 else 0.0
+        share = 0.02 * len(follower.tracklets[1].frames) / 25 if roi.x > 150 else 0.0
         return (100 * (shape + share * moving)).astype(np.float32), 0.9, None
 
-    follower = FaceFollower(Mock(detect=detect, landmarks=landmarks))
-    for index in range(100):
-        follower.add(index, index / 25, picture)
-    still, small = follower.tracklets
-    assert len(still.frames) == len(small.frames) == 100
-    assert picture.min() == 90 and follower.widest is not None
+    detector.landmarks = landmarks  # type: ignore[method-assign]
+    follower = FaceFollower(cast(FaceLandmarker, detector))
+    follow(detector, range(30), follower)
+    assert follower.widest is not None and follower.widest.tolist() == photograph.box.tolist()
+    follow(detector, range(30, 60), follower)
     assert follower.widest.tolist() == speaker.box.tolist()
+    follower.add(60, 2.4, np.zeros((256, 256, 3), np.uint8), sudden=True)
+    assert follower.widest.tolist() == photograph.box.tolist()
+    follow(detector, range(61, 121), follower)
+    detector.whole = [photograph]
+    follow(detector, range(121, 150), follower)
+    assert follower.widest.tolist() == photograph.box.tolist()
 
 
 def test_behind_a_cut_a_face_is_looked_at_anew_however_shortly_it_is_seen() -> None:
     face = Face(np.float32([100, 100, 299, 299]), np.zeros((6, 2), np.float32), 0.9)
     points = np.random.default_rng(0).normal(200, 40, (478, 3)).astype(np.float32)
-    landmarker = Mock(landmarks=lambda *_: (points, 0.9, None))
-    follower, picture = FaceFollower(landmarker), np.full((480, 640, 3), 90, np.uint8)
+    detector = Detector([])
+    detector.landmarks = lambda *_: (points, 0.9, None)  # type: ignore[method-assign]
+    follower, picture = FaceFollower(cast(FaceLandmarker, detector)), np.full((480, 640, 3), 90, np.uint8)
     gone = {33, *range(36, 60)}  # the first picture behind the cut, and soon for good
     for index in range(60):
-        landmarker.detect = lambda *_, index=index, **__: [] if index in gone else [face]
+        detector.whole = [] if index in gone else [face]
         follower.add(index, index / 25, picture, sudden=index == 33)
     (followed,) = follower.tracklets
     before, behind = followed.shots((np.arange(60) >= 33).astype(np.int32))
@@ -160,14 +212,12 @@ def test_a_face_that_is_soon_seen_again_nearly_where_it_was_is_the_same(
     gone: int, jump_px: float, tracklets: int
 ) -> None:
     """Of 200 px; ten pictures are .4 s from the last sight of it."""
-    follower, picture = (
-        FaceFollower(Mock(landmarks=lambda *_: (None, 0.0, None))),
-        np.zeros((480, 640, 3), np.uint8),
-    )
+    detector, picture = Detector([]), np.zeros((480, 640, 3), np.uint8)
+    follower = FaceFollower(cast(FaceLandmarker, detector))
     for index in range(40):
         box = np.float32([100, 100, 300, 300]) + np.float32([jump_px, 0, jump_px, 0]) * (index >= 20)
         seen = [] if 20 <= index < 20 + gone - 1 else [Face(box, np.zeros((6, 2), np.float32), 0.9)]
-        follower._landmarker.detect = lambda *_, seen=seen, **__: seen
+        detector.whole = seen
         follower.add(index, index / 25, picture)
     assert len(follower.tracklets) == tracklets
 

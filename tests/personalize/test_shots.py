@@ -50,19 +50,22 @@ def test_a_small_face_that_moves_in_a_still_picture_repeats_nothing() -> None:
     moved, face = screen.copy(), np.array([1100, 600, 1130, 640], np.float32)
     moved[628:631, 1112:1116] ^= 31  # a mouth
     changes = Changes()
-    assert changes.next(screen, face) == ((0.0, False), (0.0, False))
-    (whole, same), (near, alike) = changes.next(moved, face)
+    assert changes.next(screen, [face]) == ((0.0, False), (0.0, False))
+    (whole, same), (near, alike) = changes.next(moved, [face])
     assert same and not alike and near > 10 * whole
-    assert changes.next(moved, face) == ((0.0, True), (0.0, True))
+    near_face = near
+    assert changes.next(moved, [face]) == ((0.0, True), (0.0, True))
     # What changes elsewhere counts as well: another slide, of which the still face sees nothing.
     slide = moved.copy()
     slide[:300, :600] = 255
-    other, (near, alike) = changes.next(slide, face)
+    other, (near, alike) = changes.next(slide, [face])
     assert (near, alike) == other and near > 10 and not alike
-    changes.next(moved, face)
+    changes.next(moved, [face])
     # A large face is a large part of the picture.
-    whole_only = changes.next(screen, np.array([200, 100, 900, 700], np.float32))
+    large = np.array([200, 100, 900, 700], np.float32)
+    whole_only = changes.next(screen, [large])
     assert whole_only[0] == whole_only[1] == (whole, True)
+    assert changes.next(moved, [large, face])[1] == (near_face, False)  # as that of a photograph on a slide
 
 
 @pytest.mark.parametrize(

@@ -81,14 +81,10 @@ def test_faces_are_merged_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Means of detections may overlap though these did not: in the whole picture they are faces of their own."""
     boxes = np.float32([[0, 0, 60, 60], [12, 0, 72, 60]])
     near = [Face(box, np.zeros((6, 2), np.float32), score) for box, score in zip(boxes, (0.9, 0.8))]
-    seen = {"whole": near, "tile": []}
-    monkeypatch.setattr(
-        FaceDetector, "_detect_in", lambda self, rgb, _: list(seen["whole" if len(rgb) == 100 else "tile"])
-    )
+    monkeypatch.setattr(FaceDetector, "_detect_in", lambda self, rgb, _: list(near))
     detector, picture = object.__new__(FaceDetector), np.zeros((100, 100, 3), np.uint8)
-    assert detector.detect(picture, tiled=True) == near
-    seen["whole"], seen["tile"] = [], near
-    (face,) = detector.detect(picture, tiled=True)  # the same two, seen in several tiles
+    assert detector.detect(picture) == near
+    (face,) = detector.search(picture)  # the same two, seen in several tiles
     assert face.score == np.float32(0.9)
 
 
@@ -219,8 +215,8 @@ def test_small_faces_need_tiles(head: HeadModel, landmarker: FaceLandmarker) -> 
     small = cv2.resize(picture, (110, 110), interpolation=cv2.INTER_AREA)
     wide = np.full((1080, 1920, 3), 90, np.uint8)
     wide[300:410, 1500:1610] = small
-    assert landmarker.detect(wide) == []
-    (face,) = landmarker.detect(wide, tiled=True)
+    assert landmarker.detector.detect(wide) == []
+    (face,) = landmarker.detector.search(wide)
     assert 1500 < face.box[0] < face.box[2] < 1610 and 300 < face.keypoints[2, 1] < 410
 
 
@@ -232,10 +228,14 @@ def test_a_small_face_that_is_meant_is_found_beside_a_large_one(
     wide = np.full((1080, 1920, 3), 90, np.uint8)
     wide[300:410, 1500:1610] = cv2.resize(picture, (110, 110), interpolation=cv2.INTER_AREA)
     wide[100:900, 200:1000] = cv2.resize(picture, (800, 800))
-    assert [face.box[0] < 1000 for face in landmarker.detect(wide, tiled=True)] == [True]
+    detector = landmarker.detector
+    (large,) = detector.detect(wide)
+    assert large.box[0] < 1000
     found = LandmarkTracker(landmarker).next(wide, np.float32([1530, 320, 1580, 400]))
     assert found is not None and 1500 < found[0][:, 0].min() < found[0][:, 0].max() < 1610
-    assert landmarker.detect(wide, near=np.float32([2500, 320, 2550, 370])) == []
+    (small,) = detector.search(wide, besides=[large.box])
+    assert small.box[0] > 1500 and (wide[100:900, 200:1000].max() > 90)
+    assert detector.detect_near(wide, np.float32([2500, 320, 2550, 370])) == []
 
 
 def test_a_clip_loses_and_finds_the_face(head: HeadModel) -> None:
@@ -281,16 +281,27 @@ NOTHING = np.zeros((300, 600, 3), np.uint8)
 
 
 class _Crowd:
-    """A landmarker before which stand faces [n, 3] px: where, and how wide. What was asked of it is kept."""
+    """A landmarker and its detector, before which stand faces [n, 3] px: where, and how wide.
+
+    searched: for each look at a whole picture, whether tiles were searched too.
+    """
 
     def __init__(self, *faces: tuple[float, float, float]) -> None:
         self.faces = np.array(faces, np.float64).reshape(-1, 3)
-        self.tiled: list[bool] = []
+        self.searched: list[bool] = []
         self.regions: list[Roi] = []
+        self.detector = self
 
-    def detect(self, rgb: np.ndarray, tiled: bool = False, near: np.ndarray | None = None) -> list[Face]:
-        self.tiled.append(tiled)
+    def detect(self, rgb: np.ndarray) -> list[Face]:
+        self.searched.append(False)
         return [self._face(*one) for one in self.faces]
+
+    def detect_near(self, rgb: np.ndarray, box: np.ndarray) -> list[Face]:
+        return []
+
+    def search(self, rgb: np.ndarray) -> list[Face]:
+        self.searched[-1] = True
+        return []
 
     @staticmethod
     def _face(x: float, y: float, width: float) -> Face:
@@ -337,17 +348,18 @@ def test_a_face_that_is_found_is_read_again_in_the_region_of_its_landmarks() -> 
     assert crowd.regions == [detected, own, own]
 
 
-def test_tiles_are_searched_once_in_a_while_when_there_is_no_face() -> None:
+def test_tiles_are_searched_once_in_a_while_when_there_is_no_face(monkeypatch: pytest.MonkeyPatch) -> None:
     crowd = _Crowd()
     tracker = LandmarkTracker(cast(FaceLandmarker, crowd))
     for _ in range(2 * SEARCH_INTERVAL + 1):
         assert tracker.next(NOTHING) is None
-    assert np.flatnonzero(crowd.tiled).tolist() == [0, SEARCH_INTERVAL, 2 * SEARCH_INTERVAL]
+    assert np.flatnonzero(crowd.searched).tolist() == [0, SEARCH_INTERVAL, 2 * SEARCH_INTERVAL]
     crowd.faces = np.array([[300.0, 150.0, 100.0]])
     assert tracker.next(NOTHING) is not None
-    crowd.faces[0, 0] = 1e6  # lost: tiles are searched at once
+    crowd.faces = np.zeros((0, 3))  # lost: tiles are searched at once
+    monkeypatch.setattr(crowd, "landmarks", lambda rgb, roi: (None, 0.0, None))
     tracker.next(NOTHING)
-    assert crowd.tiled[-1]
+    assert crowd.searched[-1]
 
 
 def test_frames_come_as_long_after_each_other_as_their_times_say(monkeypatch: pytest.MonkeyPatch) -> None:
