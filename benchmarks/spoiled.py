@@ -113,7 +113,7 @@ class Cover(Spell):
 
 
 class Small:
-    """The head, small in the corner of a wide picture: amid its own blurred enlargement, or a slide with a photograph.
+    """The head, small in the corner of a wide picture, which is empty or shows a photograph.
 
     eyes: px between them. photograph: the film's first picture with a face.
     """
@@ -129,17 +129,15 @@ class Small:
                 return np.zeros((WIDE[1], WIDE[0], 3), np.uint8)
             self._first = rgb, self._inset(points)
         still, place = self._first
-        scale = WIDE[1] / rgb.shape[0]
+        out = np.full((WIDE[1], WIDE[0], 3), 200, np.uint8)
         if self._with_photograph:
-            out = np.full((WIDE[1], WIDE[0], 3), 245, np.uint8)
+            scale = WIDE[1] / still.shape[0]
             large = cv2.resize(still, None, fx=scale, fy=scale)[:, : WIDE[0] // 2]
             out[:, : large.shape[1]] = large
-        else:
-            out = cv2.GaussianBlur(cv2.resize(rgb, WIDE), (0, 0), 12)
         side = round(2 * INSET * self._eyes)
         blurred = cv2.GaussianBlur(rgb, (0, 0), max(0.5 / place[0, 0] - 0.5, 0.01))
         out[-side:, -side:] = cv2.warpAffine(blurred, place, (side, side), flags=cv2.INTER_LINEAR)
-        return np.asarray(out, np.uint8)
+        return out
 
     def _inset(self, points: F32) -> F64:
         """[2, 3] from px of the film to those of what is seen of it."""
@@ -210,8 +208,8 @@ def ways() -> dict[str, tuple[Picture | Spell, int]]:
         "shaken, four times": (Shaken((1.5, 4.5, 7.5, 10.0), 0.1, 0.3), 18),
         "a ball, for 5.5 s": (Cover((1.0,), 0.5, 5.5, skin=False, wide=0.56, aside=-0.1), 18),
         "a ball, from 1 s on": (Cover((1.0,), 0.3, SECONDS, skin=False, wide=0.56, aside=-0.1), 18),
-        "small amid its blur": (Small(62, photograph=False), 18),
-        "beside a photograph": (Small(75, photograph=True), 18),
+        "small": (Small(62, photograph=False), 18),
+        "small, by a photograph": (Small(75, photograph=True), 18),
     }
 
 
