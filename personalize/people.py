@@ -118,7 +118,7 @@ class FaceFollower:
         """Look at the next picture [H, W, 3]. sudden: there may be a cut before it, and every face another one."""
         if sudden:
             for followed in self._open:
-                followed.next_sample, followed.still = time, False
+                followed.next_sample = time
                 followed.latest.clear()
         self._open = [t for t in self._open if time - t.sightings[-1].time <= MAX_LOST_S]
         waiting = list(self._open)

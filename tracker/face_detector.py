@@ -165,13 +165,10 @@ class FaceDetector:
     def search(self, rgb: NDArray[np.uint8], besides: Sequence[F32] = ()) -> list[Face]:
         """Faces in ever smaller tiles of rgb [H, W, 3] until there is one, best score first.
 
-        besides: [4] px, boxes of faces that are known: their heads are painted over, and what is found there is none.
+        besides: [4] px, boxes of faces that are known: what is found in their heads is none.
         """
         height, width = rgb.shape[:2]
         heads = [_head(box) for box in besides]
-        rgb = rgb.copy() if heads else rgb
-        for left, top, right, bottom in np.maximum(np.round(heads), 0).astype(int).reshape(-1, 4):
-            rgb[top:bottom, left:right] = 0
         for divisor in TILE_DIVISORS:
             parts = (
                 self._detect_in(rgb[top : top + side, left : left + side], (left, top))
