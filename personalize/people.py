@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.face_detector import Face, around, holds, merged
+from tracker.face_detector import Face, around, holds
 from tracker.landmarker import FaceLandmarker, roi_from_face
 from tracker.similarity import similarity
 
@@ -23,6 +23,7 @@ PATCH = 64  # px, side of the face for light and sharpness
 MIDDLE = np.s_[PATCH // 4 :, PATCH // 5 : -PATCH // 5]  # of it: no background, which may be a white wall
 BRIGHTEST = 250  # a colour value that the camera may have cut off
 MIN_OVERLAP = 0.3  # intersection over union of a face's boxes from one picture to the next
+SURE_OVERLAP = 0.5  # below which it is looked for once more: a head that is small may be taken for a face
 MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
 SAMPLE_S = 0.6  # time between two looks at the face's shape
 MIN_PRESENCE = 0.5  # of the landmarker: what it does not take for a face is none, whatever the detector says
@@ -160,12 +161,12 @@ class FaceFollower:
         faces = detector.detect(rgb)
         # One too small for the whole picture is missed there, or seen at a wrong size, or beside another.
         seen = [face.box for face in faces]
-        missed = [box for box in self.boxes if not _meets(box, seen)]
+        missed = [box for box in self.boxes if not _meets(box, seen, SURE_OVERLAP)]
         # The surroundings of two may show the same face.
-        faces = apart(merged([*faces, *(face for box in missed for face in detector.detect_near(rgb, box))]))
+        faces = apart([*faces, *(face for box in missed for face in detector.detect_near(rgb, box))])
         if time - self._searched >= (SELDOM_S if faces else SEARCH_S):
             self._searched = time
-            faces += detector.search(rgb, besides=[face.box for face in faces])
+            faces += apart(detector.search(rgb, besides=[face.box for face in faces]))
         return faces
 
     def _sample(self, tracklet: Tracklet, time: float, face: Face, rgb: U8) -> tuple[F32, U8] | None:
@@ -181,9 +182,9 @@ class FaceFollower:
 
 
 def apart(faces: list[Face]) -> list[Face]:
-    """Faces, surest first, without any that holds the middle of one before it, or has its own in that one's box."""
+    """Of faces one of which holds the other's middle the surer, best score first."""
     kept: list[Face] = []
-    for face in faces:
+    for face in sorted(faces, key=lambda face: -face.score):
         if not any(holds(face.box, other.box) or holds(other.box, face.box) for other in kept):
             kept.append(face)
     return kept
@@ -235,9 +236,9 @@ def _overlap(a: F32, b: F32) -> float:
     return shared / max(float(np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2])) - shared, 1e-9)
 
 
-def _meets(box: F32, others: list[F32]) -> bool:
-    """Whether a box is another place of one of the others' faces."""
-    return any(_overlap(box, other) >= MIN_OVERLAP for other in others)
+def _meets(box: F32, others: list[F32], least: float) -> bool:
+    """Whether a box and one of the others overlap by so much."""
+    return any(_overlap(box, other) >= least for other in others)
 
 
 def align(shapes: F64, reference: F64) -> F64:

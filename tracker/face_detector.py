@@ -163,21 +163,19 @@ class FaceDetector:
         return self._detect_in(part, (left, top)) if part.size else []
 
     def search(self, rgb: NDArray[np.uint8], besides: Sequence[F32] = ()) -> list[Face]:
-        """Faces in ever smaller tiles of rgb [H, W, 3] until there is one, best score first.
+        """Faces in ever smaller tiles of rgb [H, W, 3], best score first.
 
         besides: [4] px, boxes of faces that are known: what is found in their heads is none.
         """
         height, width = rgb.shape[:2]
         heads = [_head(box) for box in besides]
-        for divisor in TILE_DIVISORS:
-            parts = (
-                self._detect_in(rgb[top : top + side, left : left + side], (left, top))
-                for left, top, side in tiles(width, height, divisor)
-            )
-            faces = merged(face for part in parts for face in part)
-            if found := [face for face in faces if not any(holds(head, face.box) for head in heads)]:
-                return found
-        return []
+        parts = (
+            self._detect_in(rgb[top : top + side, left : left + side], (left, top))
+            for divisor in TILE_DIVISORS
+            for left, top, side in tiles(width, height, divisor)
+        )
+        faces = merged(face for part in parts for face in part)
+        return [face for face in faces if not any(holds(head, face.box) for head in heads)]
 
     def _detect_in(self, rgb: NDArray[np.uint8], offset: tuple[int, int]) -> list[Face]:
         """Faces, in px of the whole picture, in one cut-out at `offset` (left, top)."""

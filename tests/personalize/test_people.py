@@ -121,8 +121,9 @@ def test_small_faces_that_are_found_near_each_other_are_followed_once_each() -> 
 
 
 def test_a_small_face_is_followed_while_the_whole_picture_shows_another() -> None:
-    small, bust, large = face(200, 60, 230, 90), face(185, 40, 250, 105, score=0.55), face(20, 40, 140, 160)
-    for whole, tracklets in ((bust, [range(12)]), (large, [range(12), range(2, 12)])):
+    small, large = face(200, 60, 230, 90), face(20, 40, 140, 160)
+    busts = [face(185, 40, 250, 105, score=0.55), face(190, 52, 240, 102, score=0.55)]
+    for whole, tracklets in (*((bust, [range(12)]) for bust in busts), (large, [range(12), range(2, 12)])):
         detector = Detector([], near=[small], tiles=[small])
         follower = follow(detector, range(2))
         detector.whole = [whole]
@@ -133,9 +134,10 @@ def test_a_small_face_is_followed_while_the_whole_picture_shows_another() -> Non
 
 
 def test_of_faces_within_each_other_the_surest_stays() -> None:
-    sure, around_it, in_a_corner = face(40, 40, 60, 60), face(0, 0, 80, 80), face(56, 56, 58, 58)
-    above_it, beside = face(30, 0, 70, 49), face(70, 40, 90, 60)
-    assert apart([sure, around_it, in_a_corner, beside, above_it]) == [sure, beside, above_it]
+    sure, around_it = face(40, 40, 60, 60), face(0, 0, 80, 80, score=0.8)
+    in_a_corner, above_it = face(56, 56, 58, 58, score=0.7), face(30, 0, 70, 49, score=0.5)
+    beside = face(70, 40, 90, 60, score=0.6)
+    assert apart([around_it, in_a_corner, above_it, sure, beside]) == [sure, beside, above_it]
 
 
 def test_small_faces_are_searched_for_every_second_and_beside_others_every_three() -> None:
