@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.face_detector import Face, around, holds
+from tracker.face_detector import Face, around, holds, overlaps
 from tracker.landmarker import FaceLandmarker, roi_from_face
 from tracker.similarity import similarity
 
@@ -124,13 +124,13 @@ class FaceFollower:
         self._open = [t for t in self._open if time - t.sightings[-1].time <= MAX_LOST_S]
         waiting = list(self._open)
         for face in self._find(time, rgb):
-            tracklet = max(waiting, key=lambda t: _overlap(t.box, face.box), default=None)
-            if tracklet is None or _overlap(tracklet.box, face.box) < MIN_OVERLAP:
+            shared = _overlaps(face.box, [followed.box for followed in waiting])
+            if max(shared, default=0.0) >= MIN_OVERLAP:
+                tracklet = waiting.pop(int(shared.argmax()))
+            else:
                 tracklet = Tracklet([])
                 self.tracklets.append(tracklet)
                 self._open.append(tracklet)
-            else:
-                waiting.remove(tracklet)
             patch = _face_patch(rgb, face.box)
             grey = cv2.cvtColor(patch, cv2.COLOR_RGB2GRAY)
             sighting = Sighting(
@@ -161,7 +161,7 @@ class FaceFollower:
         faces = detector.detect(rgb)
         # One too small for the whole picture is missed there, or seen at a wrong size, or beside another.
         seen = [face.box for face in faces]
-        missed = [box for box in self.boxes if not _meets(box, seen, SURE_OVERLAP)]
+        missed = [box for box in self.boxes if max(_overlaps(box, seen), default=0.0) < SURE_OVERLAP]
         # The surroundings of two may show the same face.
         faces = apart([*faces, *(face for box in missed for face in detector.detect_near(rgb, box))])
         if time - self._searched >= (SELDOM_S if faces else SEARCH_S):
@@ -229,16 +229,9 @@ def sharpness(grey: U8) -> float:
     return float(cv2.Laplacian(grey, cv2.CV_32F).std() / (grey.std() + 1.0))
 
 
-def _overlap(a: F32, b: F32) -> float:
-    """Intersection over union of two boxes."""
-    sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
-    shared = float(np.prod(np.maximum(sides, 0)))
-    return shared / max(float(np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2])) - shared, 1e-9)
-
-
-def _meets(box: F32, others: list[F32], least: float) -> bool:
-    """Whether a box and one of the others overlap by so much."""
-    return any(_overlap(box, other) >= least for other in others)
+def _overlaps(box: F32, others: list[F32]) -> F32:
+    """Intersection over union [n] of a box [4] px with n others."""
+    return overlaps(box.reshape(2, 2), np.reshape(others, (-1, 2, 2)))
 
 
 def align(shapes: F64, reference: F64) -> F64:

@@ -234,7 +234,7 @@ def test_a_small_face_that_is_meant_is_found_beside_a_large_one(
     found = LandmarkTracker(landmarker).next(wide, np.float32([1530, 320, 1580, 400]))
     assert found is not None and 1500 < found[0][:, 0].min() < found[0][:, 0].max() < 1610
     (small,) = detector.search(wide, besides=[large.box])
-    assert small.box[0] > 1500 and (wide[100:900, 200:1000].max() > 90)
+    assert small.box[0] > 1500
     assert detector.detect_near(wide, np.float32([2500, 320, 2550, 370])) == []
 
 
