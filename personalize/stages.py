@@ -115,7 +115,7 @@ class CameraStage(Stage):
 class TrackStage(Stage):
     """One identity, and expression, pose and gaze in every frame, jointly over the clip."""
 
-    name, version = "track", 13
+    name, version = "track", 14
     needs = (
         *("ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz"),
@@ -144,7 +144,7 @@ class TrackStage(Stage):
 class Refine(Stage):
     """The track again, with the grey levels of the skin."""
 
-    name, folder, version = "refine", "photometric", 29
+    name, folder, version = "refine", "photometric", 30
     needs = (
         *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),

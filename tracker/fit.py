@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 LEAST_EVIDENCE = 0.02  # of a covered frame: enough to hold a pose where no neighbour does
 LIP_BIAS = 0.001  # m
+# Frames that are shut if any are (one may be a slip), and by how much shut lips differ from frame to frame, m.
+SURELY_SHUT, AS_SHUT_M = 2, 0.0005
 # Times the usual time between measured frames, and at least so long: what is missing does not end a run sooner.
 MISSING, MISSING_S = 2.5, 0.15
 
@@ -131,8 +133,8 @@ def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
     """The energy whose inner-lip landmarks are, on shut lips, as far apart as in the frames at rest that are most shut.
 
     The landmarker keeps the lips of a shut mouth apart, on each face by its own amount; what exceeds LIP_BIAS is taken
-    for an open mouth, and frames in which the lips are farther apart tell nothing of it, unless all are. x: [n, P], of
-    which the rotations are read.
+    for an open mouth. Of frames at rest many show open lips if a mouth seldom shuts: those whose lips are farther apart
+    than AS_SHUT_M more than in the most shut ones tell nothing of it. x: [n, P], of which the rotations are read.
     """
     model = energy.model
     named = model.landmarks[model.pairs]
@@ -142,9 +144,10 @@ def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
     apart = energy.observed[rest][:, upper] - energy.observed[rest][:, lower]
     height = np.einsum("nqi,ni->nq", apart, up) / (up**2).sum(1, keepdims=True)
     height -= model.touch[lips]
-    shut = np.argsort(height.mean(1), kind="stable")[: max(1, len(rest) // 2)]
-    touching = shut[height[shut].mean(1) <= LIP_BIAS]
-    bias = np.clip(np.median(height[touching if len(touching) else shut], axis=0), -LIP_BIAS, LIP_BIAS)
+    narrow = height[np.argsort(height.mean(1), kind="stable")][: max(1, len(rest) // 2)]
+    opening = narrow.mean(1)
+    shut = narrow[opening <= opening[:SURELY_SHUT][-1] + AS_SHUT_M]
+    bias = np.clip(np.median(shut, axis=0), -LIP_BIAS, LIP_BIAS)
     mean, touch = model.mean.copy(), model.touch.copy()
     mean[upper, 1] += bias / 2
     mean[lower, 1] -= bias / 2
