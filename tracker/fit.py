@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 LEAST_EVIDENCE = 0.02  # of a covered frame: enough to hold a pose where no neighbour does
 LIP_BIAS = 0.001  # m
 # Frames that are shut if any are (one may be a slip), and by how much shut lips differ from frame to frame, m.
-SURELY_SHUT, AS_SHUT_M = 2, 0.0005
+SURELY_SHUT, AS_SHUT_M = 2, 0.0007
 # Times the usual time between measured frames, and at least so long: what is missing does not end a run sooner.
 MISSING, MISSING_S = 2.5, 0.15
 

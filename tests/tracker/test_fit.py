@@ -147,23 +147,29 @@ def test_shut_lips_read_shut_though_the_landmarker_keeps_them_apart():
 
 
 @pytest.mark.parametrize(
-    ("shut", "apart_mm", "open_mm"),
-    [(3, 0.3, (2, 6)), (3, 0.8, (2, 6)), (3, 0.1, (0.75, 0.95)), (0, 1.0, (2, 6))],
+    ("shut_mm", "open_mm", "told_mm"),
+    [
+        ([0.3] * 3, (2, 6), 0.3),
+        ([0.8] * 3, (2, 6), 0.8),
+        ([0.1] * 3, (0.85, 0.99), 0.1),
+        ([0.5] * 2 + [1.1] * 8, (2, 6), 1.0),
+        ([], (2, 6), 1.0),
+    ],
 )
 def test_lips_that_hardly_ever_shut_are_not_taken_for_shut(
-    shut: int, apart_mm: float, open_mm: tuple[float, float]
+    shut_mm: list[float], open_mm: tuple[float, float], told_mm: float
 ):
-    """Of twenty frames `shut` have lips that touch and are seen apart_mm apart, the others stand open by `open_mm`."""
+    """Of twenty frames the first have lips that touch and are seen `shut_mm` apart, others open by `open_mm`."""
     talker = Talker(20, noise=0.0, held=(slice(0, 20), {}))
     energy, x, *_ = resume(talker.fit(), talker.landmarks, CAMERA, HEAD)
     model = landmark_model(HEAD, Weights())
     lips = [k for k, pair in enumerate(model.landmarks[model.pairs].tolist()) if tuple(pair) in LIP_PAIRS]
     upper, lower = model.pairs[lips].T
     seen = replace(energy, model=model, observed=energy.observed.copy())
-    down = 1e-3 * np.where(np.arange(20) < shut, apart_mm, np.linspace(*open_mm, 20)) * energy.px_per_m
+    down = 1e-3 * np.array([*shut_mm, *np.linspace(*open_mm, 20 - len(shut_mm))]) * energy.px_per_m
     seen.observed[:, lower] = seen.observed[:, upper] + np.stack([0 * down, down], axis=-1)[:, None]
     bias = 1e3 * (with_lips_shut(seen, x, np.arange(20)).model.touch - model.touch)[lips]
-    np.testing.assert_allclose(bias, apart_mm, atol=0.15)
+    np.testing.assert_allclose(bias, told_mm, atol=0.15)
 
 
 def test_shut_lips_are_read_in_bare_frames():
