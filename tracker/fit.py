@@ -133,8 +133,8 @@ def with_lips_shut(energy: Energy, x: F64, rest: Frames) -> Energy:
     """The energy whose inner-lip landmarks are, on shut lips, as far apart as in the frames at rest that are most shut.
 
     The landmarker keeps the lips of a shut mouth apart, on each face by its own amount; what exceeds LIP_BIAS is taken
-    for an open mouth. Of frames at rest many show open lips if a mouth seldom shuts: those whose lips are farther apart
-    than AS_SHUT_M more than in the most shut ones tell nothing of it. x: [n, P], of which the rotations are read.
+    for an open mouth. Of frames at rest many show open lips if a mouth seldom shuts: only the more shut half tells of
+    it, and of that what is within AS_SHUT_M of the most shut ones. x: [n, P], of which the rotations are read.
     """
     model = energy.model
     named = model.landmarks[model.pairs]
