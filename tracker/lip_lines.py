@@ -54,14 +54,10 @@ class LipLines:
 
     def read(self, rgb: U8, row: int) -> U8:
         """[Q, S, 3] u8: the colours of a picture [H, W, 3] along the lines of frame `row`."""
-        places = self.middle[row][:, None] + SAMPLES[:, None] * self.step[row]
-        size = np.array(rgb.shape[1::-1])
-        low = np.clip(np.floor(places.min((0, 1))).astype(int) - 4, 0, size - 1)
-        high = np.clip(np.ceil(places.max((0, 1))).astype(int) + 5, low + 1, size)
-        blur = max(BLUR * STEP_MM * float(np.linalg.norm(self.step[row])), LEAST_BLUR_PX)
-        mouth = cv2.GaussianBlur(rgb[low[1] : high[1], low[0] : high[0]], (0, 0), blur)
-        x, y = np.moveaxis((places - low).astype(np.float32), 2, 0)
-        return cv2.remap(mouth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        px_per_mm = float(np.linalg.norm(self.step[row]))
+        return sampled(
+            rgb, self.middle[row][:, None] + SAMPLES[:, None] * self.step[row], STEP_MM * px_per_mm
+        )
 
     def widths(self, observed: F64) -> F64:
         """[n, Q] mm, how far apart landmarks [n, 478, 2] px have the inner lips."""
@@ -77,6 +73,16 @@ class LipLines:
         out[:, upper] -= move
         out[:, lower] += move
         return out
+
+
+def sampled(rgb: U8, places: F64, apart: float) -> U8:
+    """[.., 3] u8: the colours of a picture [H, W, 3] at places [.., 2] px that lie so many px apart."""
+    size = np.array(rgb.shape[1::-1])
+    low = np.clip(np.floor(places.min((0, 1))).astype(int) - 4, 0, size - 1)
+    high = np.clip(np.ceil(places.max((0, 1))).astype(int) + 5, low + 1, size)
+    part = cv2.GaussianBlur(rgb[low[1] : high[1], low[0] : high[0]], (0, 0), max(BLUR * apart, LEAST_BLUR_PX))
+    x, y = np.moveaxis((places - low).astype(np.float32), 2, 0)
+    return cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def fineness(colours: U8) -> float:

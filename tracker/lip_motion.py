@@ -7,6 +7,7 @@ that agree with both err by a fifth less.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -36,41 +37,68 @@ MOVED_MM, MOVED_SHARE = 0.1, 0.2
 DOUBT_MM = 1.0  # by which edges and motion disagree where the motion counts half
 
 
-def steadied(edges: F64, colours: U8, run: NDArray[np.int64], time: F64) -> F64:
-    """[n, Q] mm, widths between edges [n, Q, 2] mm along lines of colours [n, Q, S, 3] u8 that agree with their motion.
+# By frames apart: [n - apart, Q] mm by which the widths of n frames grow until then.
+Motion = dict[int, F64]
 
-    run: [n], the same number for frames between which lips may be followed, -1 for frames in which they are not.
-    time: [n] s, ascending. Least squares over both, line by line: the widths' own, and their changes between frames
-    1, 2, 4, .. apart.
+
+def links(time: F64) -> list[int]:
+    """How many frames lie between those that are compared, of frames at `time` [n] s, ascending: 1, 2, 4, ..."""
+    farthest = np.clip(LONGEST_S / STEP_S / _step(time), 1, MOST_APART)
+    return [2**n for n in range(int(np.log2(farthest)) + 1)]
+
+
+def steadied(edges: F64, motions: Sequence[Motion], run: NDArray[np.int64], time: F64) -> F64:
+    """[n, Q] mm, widths between edges [n, Q, 2] mm that agree with how the lips move, in the least squares.
+
+    motions: found in ways that err apart from each other. run: [n], the same number for frames between which lips may
+    be followed, -1 for frames in which they are not. time: [n] s, ascending.
     """
     widths = np.maximum(edges[..., 1] - edges[..., 0], 0.0)
-    count = len(widths)
-    step = float(np.median(np.diff(time))) / STEP_S if count > 1 else 1.0
-    farthest = np.clip(LONGEST_S / STEP_S / step, 1, MOST_APART)
-    links = [2**n for n in range(int(np.log2(farthest)) + 1)]
+    step = _step(time)
     weight = step * (EDGE_MM + EDGE_SHARE * widths) ** -2.0
     # The upper diagonals of the normal matrix, as solveh_banded has them, for each line.
-    normal = np.zeros((max(links) + 1, *widths.shape))
+    farthest = max(apart for motion in motions for apart in motion)
+    normal = np.zeros((farthest + 1, *widths.shape))
     right = weight * widths
     normal[-1] = weight
-    for apart in links:
-        linked = (run[apart:] == run[:-apart]) & (run[apart:] >= 0)
-        change = np.zeros((max(count - apart, 0), widths.shape[1]))
-        parts = np.array_split(np.flatnonzero(linked), THREADS)
-        list(side_by_side(partial(_fill_changes, colours, edges, apart, change), parts))
-        change *= STRETCH
-        told = widths[apart:] - widths[:-apart]
-        fast = np.maximum(np.abs(told), np.abs(change))
-        steps = (time[apart:] - time[:-apart])[:, None] / STEP_S
-        trust = step / len(links) * linked[:, None] / (np.sqrt(steps) * MOVED_MM + MOVED_SHARE * fast) ** 2
-        trust /= 1 + ((change - told) / DOUBT_MM) ** 2
-        normal[-1, :-apart] += trust
-        normal[-1, apart:] += trust
-        normal[-1 - apart, apart:] -= trust
-        right[:-apart] -= trust * change
-        right[apart:] += trust * change
+    for motion in motions:
+        for apart, change in motion.items():
+            share = step / len(motion) / len(motions)
+            told = widths[apart:] - widths[:-apart]
+            fast = np.maximum(np.abs(told), np.abs(change))
+            steps = (time[apart:] - time[:-apart])[:, None] / STEP_S
+            trust = (
+                share * linked(run, apart)[:, None] / (np.sqrt(steps) * MOVED_MM + MOVED_SHARE * fast) ** 2
+            )
+            trust /= 1 + ((change - told) / DOUBT_MM) ** 2
+            normal[-1, :-apart] += trust
+            normal[-1, apart:] += trust
+            normal[-1 - apart, apart:] -= trust
+            right[:-apart] -= trust * change
+            right[apart:] += trust * change
     lines = range(widths.shape[1])
     return np.maximum(np.stack([solveh_banded(normal[:, :, q], right[:, q]) for q in lines], axis=1), 0.0)
+
+
+def along_lines(edges: F64, colours: U8, run: NDArray[np.int64], time: F64) -> Motion:
+    """How what lies beside the edges [n, Q, 2] mm moves along lines of colours [n, Q, S, 3] u8; see `steadied`."""
+    found = {}
+    for apart in links(time):
+        found[apart] = np.zeros((max(len(edges) - apart, 0), edges.shape[1]))
+        parts = np.array_split(np.flatnonzero(linked(run, apart)), THREADS)
+        list(side_by_side(partial(_fill_changes, colours, edges, apart, found[apart]), parts))
+        found[apart] *= STRETCH
+    return found
+
+
+def linked(run: NDArray[np.int64], apart: int) -> NDArray[np.bool_]:
+    """[n - apart] frames that lips are followed from, of the runs [n] to so many frames later."""
+    return (run[apart:] == run[:-apart]) & (run[apart:] >= 0)
+
+
+def _step(time: F64) -> float:
+    """Usual time between two frames, in STEP_S."""
+    return float(np.median(np.diff(time))) / STEP_S if len(time) > 1 else 1.0
 
 
 @njit(cache=True, fastmath=True, nogil=True)

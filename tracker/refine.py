@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from tracker.energy import landmark_model
 from tracker.fit import at_rest, make_track, resume, runs, smoothness_between, trusted, with_lips_shut
 from tracker.key_frames import key_frames
+from tracker.lip_flow import LipFlow
 from tracker.lip_lines import LipLines, fineness
-from tracker.lip_motion import steadied
+from tracker.lip_motion import along_lines, links, steadied
 from tracker.lip_opening import lip_edges
 from tracker.rigid_pose import hold_poses, turned_as_far
 from tracker.skin_fit import Level, Subject, fit_landmarks, fit_stretch, learn_levels
@@ -71,8 +72,8 @@ def refine_track(
     in part where it hardly looks less so; after the grey levels they go half of that way once more.
     evidence: see `fit_track`.
     What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips and by how the
-    lips move (tracker/lip_opening.py, tracker/lip_motion.py), depth by how the skin shifts in a turn
-    (tracker/skin_identity.py), pose and jitter by the grey levels of the skin.
+    lips move (tracker/lip_opening.py, tracker/lip_motion.py, tracker/lip_flow.py), depth by how the skin shifts in a
+    turn (tracker/skin_identity.py), pose and jitter by the grey levels of the skin.
     """
     energy, x, observed, good = resume(track, landmarks, camera, head, evidence)
     unknown = np.full((len(track.time), 2), np.nan, np.float32)
@@ -84,17 +85,19 @@ def refine_track(
     count = int(np.clip(len(sound) // KEYS_APART, *KEYS))
     usual = sound[np.linspace(0, len(sound) - 1, count).round().astype(int)]
     keys = key_frames(observed[sound], energy.px_per_m[sound], count // 2).of(sound)
-    held, cuts, colours = _looked_at(subject, lines, camera, frames, good, {*usual, *keys.rows})
+    run, time = runs(good, segment, landmarks.time), landmarks.time[good]
+    apart = links(time)
+    flow = LipFlow(lines, {apart[0], apart[-1]})
+    held, cuts, colours = _looked_at(subject, lines, flow, camera, frames, good, {*usual, *keys.rows})
     rows = np.array([row for row in held if row in usual], np.int64)
     if not len(rows):
         return Refined(track, unknown)
-    run, time = runs(good, segment, landmarks.time), landmarks.time[good]
     bundle = turned_as_far(bundle, x, good, sound, camera.focal_sd_log)
     middle = energy.model.upper_face.mean(0)
     on_bundle = hold_poses(x, bundle, good, run, time, sound, middle)
     rigid = nearer_to_skin(subject, held, rows, x, on_bundle)
     x = hold_poses(x, bundle, good, run, time, sound, middle, rigid)
-    widths, like_lips = _read_widths(lines, colours, good, segment, landmarks.time, sound)
+    widths, like_lips = _read_widths(lines, colours, flow, good, segment, landmarks.time, sound)
     opened = lines.opened(observed, lines.widths(_fitted(subject, observed, x)) if widths is None else widths)
     subject = _with_landmarks(subject, opened, x, sound)
     identity = fit_identity_to_skin(subject, held, keys, x)
@@ -145,12 +148,19 @@ def _fitted_to_skin(
 
 
 def _read_widths(
-    lines: LipLines, colours: dict[int, U8], good: Index, segment: NDArray[np.int32], time: F64, sound: Index
+    lines: LipLines,
+    colours: dict[int, U8],
+    flow: LipFlow,
+    good: Index,
+    segment: NDArray[np.int32],
+    time: F64,
+    sound: Index,
 ) -> tuple[F64 | None, float]:
     """[n, Q] mm between the lips, of the colours along the lines by rows; None where they do not tell it; `like_lips`.
 
-    Rows without colours keep the landmarks' widths, and lips are not followed across them. good: [n], the rows' frames.
-    segment: [T], number of the uninterrupted shot. time: [T] s. sound: rows that are believed.
+    flow: has looked at the rows of the colours, in their order. Rows without colours keep the landmarks' widths, and
+    lips are not followed across them. good: [n], the rows' frames. segment: [T], number of the uninterrupted shot.
+    time: [T] s. sound: rows that are believed.
     """
     rows, along = np.array(list(colours)), np.stack(list(colours.values()))
     bare = np.isin(rows, sound)
@@ -159,7 +169,8 @@ def _read_widths(
         return None, like_lips
     widths = lines.marks[..., 2] - lines.marks[..., 1]
     run = np.where(bare, runs(good[rows], segment, time), -1)
-    widths[rows] = steadied(edges, along, run, time[good[rows]])
+    moved = [along_lines(edges, along, run, time[good[rows]]), flow.motion(edges)]
+    widths[rows] = steadied(edges, moved, run, time[good[rows]])
     return widths, like_lips
 
 
@@ -186,6 +197,7 @@ def _with_landmarks(subject: Subject, observed: F64, x: F64, sound: Index) -> Su
 def _looked_at(
     subject: Subject,
     lines: LipLines,
+    flow: LipFlow,
     camera: Camera,
     frames: Callable[[], Iterable[Frame]],
     good: Index,
@@ -193,13 +205,14 @@ def _looked_at(
 ) -> tuple[dict[int, U8], Iterable[tuple[int, U8]], dict[int, U8]]:
     """By rows: cut-out faces of the key frames, and of all frames `good`, and these frames' colours along the lines.
 
-    A short clip's pictures are read once.
+    flow: looks at all of them. A short clip's pictures are read once.
     """
     short = len(good) * subject.window.size[0] * subject.window.size[1] <= HELD_BYTES
     held: dict[int, U8] = {}
     colours: dict[int, U8] = {}
     for row, rgb in _pictures(camera, frames(), good):
         colours[row] = lines.read(rgb, row)
+        flow.look(rgb, row)
         if short or row in keys:
             held[row] = subject.window.cut(rgb, row)
     chosen = {row: cut for row, cut in held.items() if row in keys}

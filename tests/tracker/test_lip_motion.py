@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from tracker.lip_lines import SAMPLES
-from tracker.lip_motion import STRETCH, steadied
+from tracker.lip_motion import STRETCH, along_lines, steadied
 
 FRAMES = 100
 ONE_RUN = np.zeros(FRAMES, np.int64)
@@ -31,9 +31,10 @@ def patterned(width: np.ndarray) -> np.ndarray:
     return np.clip(out + rng.normal(size=out.shape) * 3, 0, 255).astype(np.uint8)
 
 
-def apart(width: np.ndarray) -> np.ndarray:
-    """[n, 9, 2] mm, edges that far apart."""
-    return np.stack([-width / 2, width / 2], axis=-1)
+def steady(width: np.ndarray, colours: np.ndarray, run: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """[n, 9] mm, of widths [n, 9] mm read about the lines' middles and the colours along these."""
+    edges = np.stack([-width / 2, width / 2], axis=-1)
+    return steadied(edges, [along_lines(edges, colours, run, time)], run, time)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +53,7 @@ def spoken(rate: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_lips_motion_takes_a_third_of_a_reading_error(openings: tuple[np.ndarray, np.ndarray]):
     true, read = openings
-    widths = steadied(apart(read), patterned(true), ONE_RUN, TIME)
+    widths = steady(read, patterned(true), ONE_RUN, TIME)
     assert (widths - true).std() < 0.67 * (read - true).std()
 
 
@@ -60,26 +61,26 @@ def test_the_lips_motion_takes_a_third_of_a_reading_error(openings: tuple[np.nda
 def test_at_a_higher_rate_errors_of_the_same_time_are_taken_as_far(rate: int):
     true, read = spoken(rate)
     time = np.arange(len(true)) / (25 * rate)
-    widths = steadied(apart(read), patterned(true), np.zeros(len(true), np.int64), time)
+    widths = steady(read, patterned(true), np.zeros(len(true), np.int64), time)
     assert (widths - true).std() < 0.67 * (read - true).std()
 
 
 def test_right_readings_stay(openings: tuple[np.ndarray, np.ndarray]):
     true, _ = openings
-    np.testing.assert_allclose(steadied(apart(true), patterned(true), ONE_RUN, TIME), true, atol=0.25)
+    np.testing.assert_allclose(steady(true, patterned(true), ONE_RUN, TIME), true, atol=0.25)
 
 
 def test_light_that_changes_is_no_motion(openings: tuple[np.ndarray, np.ndarray]):
     true, _ = openings
     flicker = np.where(np.arange(FRAMES) % 4 < 2, 1.0, 0.6)[:, None, None, None]
     dim = (patterned(true) * flicker).astype(np.uint8)
-    np.testing.assert_allclose(steadied(apart(true), dim, ONE_RUN, TIME), true, atol=0.25)
+    np.testing.assert_allclose(steady(true, dim, ONE_RUN, TIME), true, atol=0.25)
 
 
 def test_a_closure_of_one_frame_is_not_smoothed_away():
     true = np.full((FRAMES, 9), 5.0)
     true[50] = 0
-    widths = steadied(apart(true), patterned(true), ONE_RUN, TIME)
+    widths = steady(true, patterned(true), ONE_RUN, TIME)
     assert widths[50].max() < 0.1
     assert widths[[48, 49, 51, 52]].min() > 4.7
 
@@ -88,36 +89,32 @@ def test_a_shut_mouth_is_believed_where_motion_says_otherwise():
     true = np.full((FRAMES, 9), 5.0)
     read = true.copy()
     read[40:60] = 0
-    assert steadied(apart(read), patterned(true), ONE_RUN, TIME)[45:55].max() < 0.3
+    assert steady(read, patterned(true), ONE_RUN, TIME)[45:55].max() < 0.3
 
 
 def test_lips_are_not_followed_across_a_cut_nor_under_a_hand(openings: tuple[np.ndarray, np.ndarray]):
     true, read = openings
     colours = patterned(true)
     run = np.where(np.arange(FRAMES) < 60, 0, 1)
-    both = steadied(apart(read), colours, run, TIME)
+    both = steady(read, colours, run, TIME)
     for part in (slice(0, 60), slice(60, FRAMES)):
-        np.testing.assert_allclose(
-            both[part], steadied(apart(read[part]), colours[part], run[part], TIME[part])
-        )
+        np.testing.assert_allclose(both[part], steady(read[part], colours[part], run[part], TIME[part]))
     covered = np.where((np.arange(FRAMES) >= 40) & (np.arange(FRAMES) < 50), -1, 0)
-    np.testing.assert_allclose(steadied(apart(read), colours, covered, TIME)[40:50], read[40:50])
+    np.testing.assert_allclose(steady(read, colours, covered, TIME)[40:50], read[40:50])
 
 
 def test_times_that_are_broken_take_no_memory():
     true = np.full((FRAMES, 9), 3.0)
-    widths = steadied(apart(true), patterned(true), ONE_RUN, np.arange(FRAMES) * 1e-9)
+    widths = steady(true, patterned(true), ONE_RUN, np.arange(FRAMES) * 1e-9)
     np.testing.assert_allclose(widths, true, atol=0.1)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_a_clip_of_few_frames(count: int):
     true = np.full((count, 9), 3.0)
-    np.testing.assert_allclose(
-        steadied(apart(true), patterned(true), ONE_RUN[:count], TIME[:count]), true, atol=0.1
-    )
+    np.testing.assert_allclose(steady(true, patterned(true), ONE_RUN[:count], TIME[:count]), true, atol=0.1)
 
 
 def test_edges_that_cross_are_shut():
     crossed = np.full((3, 9), -0.5)
-    assert steadied(apart(crossed), patterned(np.zeros((3, 9))), ONE_RUN[:3], TIME[:3]).max() < 0.05
+    assert steady(crossed, patterned(np.zeros((3, 9))), ONE_RUN[:3], TIME[:3]).max() < 0.05
