@@ -97,6 +97,7 @@ def shoot(scene: Scene, head: HeadModel, path: Path) -> GroundTruth:
         lip_gap_mm=gaps,
         covered=covered,
         vertices=face.astype(np.int32),
+        eyes=moves.eyes.astype(np.float64),
     )
 
 

@@ -21,7 +21,8 @@ class GroundTruth:
     the head frame to the camera frame (OpenCV). focal: px. lip_gap_mm: [T], between the vertices of `HeadModel`'s
     opening; of another mesh what is free between the lips in the face's middle: from the lowest point of the upper one
     to the highest of the lower one. covered: [T] 0..1, share of the lips that something hides. vertices: [V] those of
-    the embedded head that these are; None where the mesh is another.
+    the embedded head that these are; None where the mesh is another. eyes: [T, 2, 3] axis-angle rad in the head frame,
+    left then right; None where they are not known.
     """
 
     neutral: F64
@@ -33,6 +34,7 @@ class GroundTruth:
     lip_gap_mm: F64
     covered: F64
     vertices: NDArray[np.int32] | None = None
+    eyes: F64 | None = None
 
     def write(self, path: Path) -> None:
         """As npz; whole or not at all. The displacement in halves of floats: to 4 µm."""

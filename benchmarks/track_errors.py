@@ -6,6 +6,8 @@ points where the meshes differ, by their vertices where they are the same mesh. 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import trimesh
 from kornia.geometry import axis_angle_to_rotation_matrix
@@ -14,6 +16,7 @@ from scipy.ndimage import binary_closing, binary_propagation, minimum_filter1d
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from scipy.stats import rankdata
 from torch import from_numpy
 
@@ -33,6 +36,8 @@ ASIDE_DEG = 45.0  # of the face's axis from the line of sight: half of the lips 
 NEAR_DEG = 30.0  # below, a head that was turned aside counts as turned back
 FAST_DEG = 4.0  # head rotation a frame from which a turn counts as fast
 RECOVERED = 1.5  # times the median error
+LIDS_OPEN = 0.5  # of how far lids are usually apart: with less, irises are hidden
+SIDES = ("left", "right")
 STILL_M = 1e-5  # a head that moves by less stands still
 
 Bool = NDArray[np.bool_]
@@ -60,6 +65,7 @@ def compare(track: Track, head: HeadModel, truth: GroundTruth) -> dict[str, floa
         errors |= face_errors(neutral, track, fitted, judged, head, truth)
     errors |= lip_errors(neutral, frame, track, judged, head, truth)
     errors |= opening_errors(openings(neutral, frame, track, head, truth), truth.lip_gap_mm, judged)
+    errors |= eye_errors(neutral, frame[0], track, judged, head, truth)
     return errors | {
         "rotation_deg": rotation_error(fitted[judged], truth.rotation[judged]),
         "focal_pct": 100 * (track.focal / truth.focal - 1),
@@ -169,6 +175,48 @@ def middle_of_lips(head: HeadModel) -> tuple[NDArray[np.integer], NDArray[np.int
     lines = (head.regions[f"inner_lip_{lip}"] for lip in ("upper", "lower"))
     upper, lower = (middle[part[middle] == part[line[len(line) // 2]]] for line in lines)
     return upper, lower
+
+
+def eye_errors(
+    neutral: F64, scale: F64, track: Track, judged: Bool, head: HeadModel, truth: GroundTruth
+) -> dict[str, float]:
+    """RMSE about the mean of how far the lids are apart, and mean angle about the mean of where eyes look while open.
+
+    NaN where the truth knows neither.
+    """
+    if truth.vertices is None or truth.eyes is None:
+        return {"lids_mm": np.nan, "gaze_deg": np.nan}
+    weights, basis, vertices = track.expression.astype(np.float64), head.expression_basis, truth.vertices
+
+    def fitted(rim: NDArray[np.integer]) -> F64:
+        return np.asarray(scale * (neutral[rim] + np.tensordot(weights, basis[:, rim], axes=1)))
+
+    def true(rim: NDArray[np.integer]) -> F64:
+        rows = np.searchsorted(vertices, rim)
+        return truth.neutral[rows] + truth.displacement[:, rows]
+
+    found, apart = (_lids_mm(places, head)[judged] for places in (fitted, true))
+    open_ = apart > LIDS_OPEN * np.median(apart)
+    looks = _looks_deg(track.eyes.astype(np.float64)) - _looks_deg(truth.eyes)
+    off = looks[judged][open_]
+    return {"lids_mm": float((found - apart).std()), "gaze_deg": _mean_norm(off - off.mean(0))}
+
+
+def _lids_mm(places: Callable[[NDArray[np.integer]], F64], head: HeadModel) -> F64:
+    """[T] mm, mean height of the upper lids' rims above the lower ones'. places: [T, n, 3] m, of n vertices."""
+    apart = []
+    for side in SIDES:
+        above, below = (head.regions[f"{side}_eyelid_{lid}"] for lid in ("upper", "lower"))
+        corners = np.intersect1d(above, below)
+        upper, lower = (places(np.setdiff1d(rim, corners))[..., 1].mean(1) for rim in (above, below))
+        apart.append(upper - lower)
+    return np.asarray(1e3 * np.mean(apart, axis=0))
+
+
+def _looks_deg(eyes: F64) -> F64:
+    """[T, 2] degrees, how far both eyes, turned by [T, 2, 3] axis-angle rad, look to the left and up on average."""
+    ahead = Rotation.from_rotvec(eyes.reshape(-1, 3)).apply((0.0, 0.0, 1.0)).reshape(eyes.shape)
+    return np.degrees(np.arctan2(ahead[..., :2], ahead[..., 2:])).mean(1)
 
 
 def opening_errors(gap: F64, true: F64, judged: Bool) -> dict[str, float]:

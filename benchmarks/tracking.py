@@ -17,6 +17,7 @@ lips, plane, depth      lip vertices about their mean over time: in all, in the 
 neutr           lip vertices against the neutral, mm
 r, rmse, about  lip opening: correlation, RMSE, RMSE about its mean, mm
 rot, focal      head rotation without the constant, degrees; focal length, %
+lids, gaze      how far lids are apart, RMSE about its mean, mm; where the eyes look, without the constant, degrees
 jitter, still   second difference of the lips' error; face vertices' rms on a clip where nothing moves, mm
 close, false    share of the lips' closures reached within one frame; of the fitted ones, upon open lips
 auc             how often a frame whose lips are hidden, behind a hand or in profile, has less confidence than others
@@ -75,6 +76,8 @@ COLUMNS = {
     "about": "opening_centred_mm",
     "rot": "rotation_deg",
     "focal": "focal_pct",
+    "lids": "lids_mm",
+    "gaze": "gaze_deg",
     "jitter": "jitter_mm",
     "still": "still_mm",
     "close": "closures",

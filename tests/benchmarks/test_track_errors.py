@@ -54,6 +54,9 @@ def exact(head: HeadModel) -> tuple[Track, GroundTruth]:
         lip_gap_mm=1.1 * gap.astype(np.float64),
         covered=np.zeros(FRAMES),
         vertices=face.astype(np.int32),
+        eyes=Rotation.from_euler("yx", random.uniform(-15, 15, (2 * FRAMES, 2)), degrees=True)
+        .as_rotvec()
+        .reshape(FRAMES, 2, 3),
     )
     track = Track(
         time=np.arange(FRAMES) / 25,
@@ -63,7 +66,7 @@ def exact(head: HeadModel) -> tuple[Track, GroundTruth]:
         expression=expression,
         jaw=np.zeros((FRAMES, 3), np.float32),
         neck=np.zeros((FRAMES, 3), np.float32),
-        eyes=np.zeros((FRAMES, 2, 3), np.float32),
+        eyes=truth.eyes.astype(np.float32),
         rotation=rotation.as_rotvec().astype(np.float32),
         translation=translation.astype(np.float32),
         focal=900.0,
@@ -116,6 +119,7 @@ def test_an_exact_track_has_no_error(
     assert errors["rotation_deg"] == pytest.approx(0, abs=0.01)
     assert errors["mean_surface_mm"] > 0.3
     if same_mesh:
+        assert errors["lids_mm"] == pytest.approx(0, abs=0.01) and errors["gaze_deg"] < 0.01
         assert errors["face_scaled_mm"] == pytest.approx(0, abs=0.01)
         # A tenth of the distance of the face's points from their middle, some 60 mm.
         assert 3 < errors["face_rigid_mm"] < 8
@@ -154,6 +158,38 @@ def test_a_lip_offset_counts_against_the_neutral_only(
     errors = compare(track, head, replace(truth, displacement=lower))
     assert errors["lip_motion_mm"] == pytest.approx(0, abs=0.01)
     assert errors["lip_neutral_mm"] == pytest.approx(2, abs=0.02)
+
+
+def test_lids_that_move_and_eyes_that_stray_are_told_without_the_constant(
+    exact: tuple[Track, GroundTruth], head: HeadModel
+) -> None:
+    track, truth = exact
+    assert truth.vertices is not None and truth.eyes is not None
+    there = np.arange(FRAMES) % 2 == 1
+    lids = np.isin(
+        truth.vertices, np.concatenate([head.regions[f"{x}_eyelid_upper"] for x in ("left", "right")])
+    )
+    raised = truth.displacement.copy()
+    raised[there[:, None] & lids] += [0, 0.002, 0]
+    errors = compare(track, head, replace(truth, displacement=raised))
+    assert errors["lids_mm"] == pytest.approx(1, abs=0.01) and errors["gaze_deg"] < 0.01
+    upwards = Rotation.from_euler("x", -4 * np.repeat(there, 2)[:, None] - 7, degrees=True)
+    strayed = (upwards * Rotation.from_rotvec(truth.eyes.reshape(-1, 3))).as_rotvec().reshape(FRAMES, 2, 3)
+    assert compare(track, head, replace(truth, eyes=strayed))["gaze_deg"] == pytest.approx(2, abs=0.1)
+
+
+def test_where_eyes_look_behind_shut_lids_does_not_count(
+    exact: tuple[Track, GroundTruth], head: HeadModel
+) -> None:
+    track, truth = exact
+    assert truth.vertices is not None and truth.eyes is not None
+    lids = np.isin(
+        truth.vertices, np.concatenate([head.regions[f"{x}_eyelid_upper"] for x in ("left", "right")])
+    )
+    shut, strayed = truth.displacement.copy(), truth.eyes.copy()
+    shut[3, lids] -= [0, 0.009, 0]
+    strayed[3] += 0.5
+    assert compare(track, head, replace(truth, displacement=shut, eyes=strayed))["gaze_deg"] < 0.01
 
 
 def test_motion_errors_are_split_into_plane_and_depth(
