@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tracker.energy import landmark_model
 from tracker.fit import at_rest, make_track, resume, runs, smoothness_between, trusted, with_lips_shut
+from tracker.irises import EyeWindows, iris_shifts
 from tracker.key_frames import key_frames
 from tracker.lip_flow import LipFlow
 from tracker.lip_lines import LipLines, fineness
@@ -52,6 +53,26 @@ class Refined:
     fineness: float = np.nan
 
 
+@dataclass(frozen=True)
+class Details:
+    """What is kept of all pictures, by rows: colours along the lines across the mouth, and greys of the eyes.
+
+    flow: follows the mouth from one look to the next.
+    """
+
+    lines: LipLines
+    flow: LipFlow
+    eyes: EyeWindows
+    colours: dict[int, U8] = field(default_factory=dict)
+    greys: dict[int, U8] = field(default_factory=dict)
+
+    def look(self, rgb: U8, row: int) -> None:
+        """At the picture [H, W, 3] of a row."""
+        self.colours[row] = self.lines.read(rgb, row)
+        self.flow.look(rgb, row)
+        self.greys[row] = self.eyes.read(rgb, row)
+
+
 def refine_track(
     track: Track,
     landmarks: Landmarks,
@@ -73,7 +94,8 @@ def refine_track(
     evidence: see `fit_track`.
     What it gains is printed by `python -m benchmarks tracking`: openings by the colours between the lips and by how the
     lips move (tracker/lip_opening.py, tracker/lip_motion.py, tracker/lip_flow.py), depth by how the skin shifts in a
-    turn (tracker/skin_identity.py), pose and jitter by the grey levels of the skin.
+    turn (tracker/skin_identity.py), gaze by the irises (tracker/irises.py), pose and
+    jitter by the grey levels of the skin.
     """
     energy, x, observed, good = resume(track, landmarks, camera, head, evidence)
     unknown = np.full((len(track.time), 2), np.nan, np.float32)
@@ -87,8 +109,8 @@ def refine_track(
     keys = key_frames(observed[sound], energy.px_per_m[sound], count // 2).of(sound)
     run, time = runs(good, segment, landmarks.time), landmarks.time[good]
     apart = links(time)
-    flow = LipFlow(lines, {apart[0], apart[-1]})
-    held, cuts, colours = _looked_at(subject, lines, flow, camera, frames, good, {*usual, *keys.rows})
+    details = Details(lines, LipFlow(lines, {apart[0], apart[-1]}), EyeWindows.of(observed, energy.px_per_m))
+    held, cuts = _looked_at(subject, details, camera, frames, good, {*usual, *keys.rows})
     rows = np.array([row for row in held if row in usual], np.int64)
     if not len(rows):
         return Refined(track, unknown)
@@ -97,7 +119,7 @@ def refine_track(
     on_bundle = hold_poses(x, bundle, good, run, time, sound, middle)
     rigid = nearer_to_skin(subject, held, rows, x, on_bundle)
     x = hold_poses(x, bundle, good, run, time, sound, middle, rigid)
-    widths, like_lips = _read_widths(lines, colours, flow, good, segment, landmarks.time, sound)
+    widths, like_lips = _read_widths(details, good, segment, landmarks.time, sound)
     opened = lines.opened(observed, lines.widths(_fitted(subject, observed, x)) if widths is None else widths)
     subject = _with_landmarks(subject, opened, x, sound)
     identity = fit_identity_to_skin(subject, held, keys, x)
@@ -109,8 +131,9 @@ def refine_track(
     levels = learn_levels(subject, [held[row] for row in rows], rows, x[rows])
     refined, deviation = _fitted_to_skin(subject, levels, cuts, x, good, segment, landmarks.time, progress)
     refined = hold_poses(refined, bundle, good, run, time, sound, middle, HALFWAY * rigid)
-    out = make_track(landmarks, camera, head, subject.energy, opened, identity, refined, good)
-    fine = fineness(np.stack([colours[row] for row in rows]))
+    looking = _with_irises(details, opened, sound)
+    out = make_track(landmarks, camera, head, subject.energy, looking, identity, refined, good)
+    fine = fineness(np.stack([details.colours[row] for row in rows]))
     return Refined(out, _relative(deviation, good, len(track.time)), like_lips, fine)
 
 
@@ -148,30 +171,32 @@ def _fitted_to_skin(
 
 
 def _read_widths(
-    lines: LipLines,
-    colours: dict[int, U8],
-    flow: LipFlow,
-    good: Index,
-    segment: NDArray[np.int32],
-    time: F64,
-    sound: Index,
+    details: Details, good: Index, segment: NDArray[np.int32], time: F64, sound: Index
 ) -> tuple[F64 | None, float]:
-    """[n, Q] mm between the lips, of the colours along the lines by rows; None where they do not tell it; `like_lips`.
+    """[n, Q] mm between the lips, of the colours along the lines; None where they do not tell it; `like_lips`.
 
-    flow: has looked at the rows of the colours, in their order. Rows without colours keep the landmarks' widths, and
-    lips are not followed across them. good: [n], the rows' frames. segment: [T], number of the uninterrupted shot.
-    time: [T] s. sound: rows that are believed.
+    Rows without colours keep the landmarks' widths, and lips are not followed across them. good: [n], the rows' frames.
+    segment: [T], number of the uninterrupted shot. time: [T] s. sound: rows that are believed.
     """
+    colours, marks = details.colours, details.lines.marks
     rows, along = np.array(list(colours)), np.stack(list(colours.values()))
     bare = np.isin(rows, sound)
-    edges, like_lips = lip_edges(along, lines.marks[rows], np.flatnonzero(bare))
+    edges, like_lips = lip_edges(along, marks[rows], np.flatnonzero(bare))
     if edges is None:
         return None, like_lips
-    widths = lines.marks[..., 2] - lines.marks[..., 1]
+    widths = marks[..., 2] - marks[..., 1]
     run = np.where(bare, runs(good[rows], segment, time), -1)
-    moved = [along_lines(edges, along, run, time[good[rows]]), flow.motion(edges)]
+    moved = [along_lines(edges, along, run, time[good[rows]]), details.flow.motion(edges)]
     widths[rows] = steadied(edges, moved, run, time[good[rows]])
     return widths, like_lips
+
+
+def _with_irises(details: Details, observed: F64, sound: Index) -> F64:
+    """The landmarks [n, 478, 2] px with irises where the pictures have them. sound: rows that are believed."""
+    rows, greys = np.array(list(details.greys)), np.stack(list(details.greys.values()))
+    shifts = np.zeros((len(observed), 2, 2))
+    shifts[rows] = iris_shifts(greys, details.eyes.seen[rows], np.flatnonzero(np.isin(rows, sound)))
+    return details.eyes.moved(observed, shifts)
 
 
 def _fitted(subject: Subject, observed: F64, x: F64) -> F64:
@@ -196,30 +221,27 @@ def _with_landmarks(subject: Subject, observed: F64, x: F64, sound: Index) -> Su
 
 def _looked_at(
     subject: Subject,
-    lines: LipLines,
-    flow: LipFlow,
+    details: Details,
     camera: Camera,
     frames: Callable[[], Iterable[Frame]],
     good: Index,
     keys: set[int],
-) -> tuple[dict[int, U8], Iterable[tuple[int, U8]], dict[int, U8]]:
-    """By rows: cut-out faces of the key frames, and of all frames `good`, and these frames' colours along the lines.
+) -> tuple[dict[int, U8], Iterable[tuple[int, U8]]]:
+    """By rows: cut-out faces of the key frames, and of all frames `good`, whose details are looked at.
 
-    flow: looks at all of them. A short clip's pictures are read once.
+    A short clip's pictures are read once.
     """
     short = len(good) * subject.window.size[0] * subject.window.size[1] <= HELD_BYTES
     held: dict[int, U8] = {}
-    colours: dict[int, U8] = {}
     for row, rgb in _pictures(camera, frames(), good):
-        colours[row] = lines.read(rgb, row)
-        flow.look(rgb, row)
+        details.look(rgb, row)
         if short or row in keys:
             held[row] = subject.window.cut(rgb, row)
     chosen = {row: cut for row, cut in held.items() if row in keys}
     if short:
-        return chosen, held.items(), colours
+        return chosen, held.items()
     again = _pictures(camera, frames(), good)
-    return chosen, ((row, subject.window.cut(rgb, row)) for row, rgb in again), colours
+    return chosen, ((row, subject.window.cut(rgb, row)) for row, rgb in again)
 
 
 def _pictures(camera: Camera, frames: Iterable[Frame], good: Index) -> Iterator[tuple[int, U8]]:

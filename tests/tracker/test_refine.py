@@ -12,12 +12,13 @@ from tracker.confidence import judge
 from tracker.energy import LIP_PAIRS, rotation_matrix
 from tracker.fit import fit_track, make_track, resume
 from tracker.head import load_head
+from tracker.irises import EyeWindows
 from tracker.landmark_indices import BLENDSHAPE_NAMES, IBUG_51, POINTS
 from tracker.lip_flow import LipFlow
 from tracker.lip_lines import LipLines
 from tracker.occlusion import Appearance
 from tracker.raster import render
-from tracker.refine import _overlap, _read_widths, _stretches, _with_landmarks, refine_track
+from tracker.refine import Details, _overlap, _read_widths, _stretches, _with_landmarks, refine_track
 from tracker.skin_fit import Subject, fit_stretch, learn_levels
 from tracker.solver import Smoothness
 from tracker.track import Bundle, Camera, Landmarks, Track
@@ -233,18 +234,16 @@ def test_what_landmarks_read_of_shut_lips_is_forgotten_when_colours_read_them(fi
 def test_lips_are_not_followed_across_pictures_that_are_missing(film: Film, monkeypatch: pytest.MonkeyPatch):
     energy, x, observed, good = resume(film.track, film.landmarks, CAMERA, HEAD)
     lines = LipLines.across(observed, energy.px_per_m, x)
-    looked_at = np.delete(np.arange(FRAMES), (8, 9, 10)).tolist()
-    colours = {row: lines.read(film.pictures[row], row) for row in looked_at}
-    flow = LipFlow(lines, [1])
-    for row in looked_at:
-        flow.look(film.pictures[row], row)
+    details = Details(lines, LipFlow(lines, [1]), EyeWindows.of(observed, energy.px_per_m))
+    for row in np.delete(np.arange(FRAMES), (8, 9, 10)).tolist():
+        details.look(film.pictures[row], row)
     told: list[np.ndarray] = []
     monkeypatch.setattr(refine, "lip_edges", lambda along, marks, sound: (marks[..., 1:3], 0.1))
     monkeypatch.setattr(
         refine, "steadied", lambda edges, motions, run, time: told.append(run) or np.ones((len(run), 9))
     )
     one_shot, time = np.zeros(FRAMES, np.int32), film.landmarks.time
-    widths, _ = _read_widths(lines, colours, flow, good, one_shot, time, np.arange(1, FRAMES))
+    widths, _ = _read_widths(details, good, one_shot, time, np.arange(1, FRAMES))
     assert widths is not None
     np.testing.assert_array_equal(told[0], [-1, *[0] * 7, *[1] * (FRAMES - 11)])
     np.testing.assert_allclose(widths[[8, 9, 10]], lines.widths(observed)[[8, 9, 10]])
