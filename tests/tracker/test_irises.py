@@ -80,6 +80,15 @@ def test_behind_shut_lids_nothing_is_read():
     np.testing.assert_array_equal(shifts(0 * OPEN, BOTH, BOTH), 0.0)
 
 
+def test_an_eye_that_winks_follows_the_other():
+    windows = EyeWindows.of(landmarks(OPEN, 0.5 * BOTH), np.full(FRAMES, 1e3 * PX_PER_MM))
+    greys = np.stack([windows.read(picture, row) for row, picture in enumerate(painted(OPEN, BOTH))])
+    winks = np.arange(5, FRAMES, 7)
+    windows.seen[winks, 1] = False
+    left, right = np.moveaxis(iris_shifts(greys, windows.seen, ALL)[winks], 1, 0)
+    assert 0.4 < np.polyfit(left[:, 0], right[:, 0], 1)[0] < 0.9
+
+
 def test_no_shift_is_longer_than_it_may_be():
     rng = np.random.default_rng(6)
     windows = EyeWindows.of(landmarks(OPEN, BOTH), np.full(FRAMES, 1e3 * PX_PER_MM))

@@ -77,6 +77,16 @@ def test_lips_part_by_what_they_are_painted_apart(px_per_mm: np.ndarray, turn: n
         assert np.sqrt(np.mean((change - true[:, None]) ** 2)) < 0.15 * np.abs(true).max()
 
 
+def test_lips_seen_backwards_close_as_they_open():
+    pictures, lines = painted(WIDTHS[:4], np.full(4, 2.0), np.zeros(4))
+    there, back = LipFlow(lines, [1]), LipFlow(lines, [1])
+    for row in range(4):
+        there.look(pictures[row], row)
+        back.look(pictures[3 - row], 3 - row)
+    edges = apart(WIDTHS[:4])
+    np.testing.assert_allclose(back.motion(edges[::-1])[1], -there.motion(edges)[1][::-1], atol=1e-6)
+
+
 def test_a_clip_too_short_for_a_link_tells_the_others_alone():
     assert list(motion(WIDTHS[:5], np.full(5, 2.0), np.zeros(5), (1, 8))) == [1]
     assert motion(WIDTHS[:1], np.full(1, 2.0), np.zeros(1), (1, 8)) == {}

@@ -118,3 +118,11 @@ def test_a_clip_of_few_frames(count: int):
 def test_edges_that_cross_are_shut():
     crossed = np.full((3, 9), -0.5)
     assert steady(crossed, patterned(np.zeros((3, 9))), ONE_RUN[:3], TIME[:3]).max() < 0.05
+
+
+def test_the_same_motion_told_twice_is_believed_no_more(openings: tuple[np.ndarray, np.ndarray]):
+    true, read = openings
+    edges = np.stack([-read / 2, read / 2], axis=-1)
+    motion = along_lines(edges, patterned(true), ONE_RUN, TIME)
+    once, twice = (steadied(edges, [motion] * times, ONE_RUN, TIME) for times in (1, 2))
+    np.testing.assert_allclose(twice, once)
