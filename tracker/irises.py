@@ -30,17 +30,17 @@ FAR_X, FAR_Y = np.meshgrid(ACROSS, DOWN)
 BELOW_UPPER_MM, ABOVE_LOWER_MM = 2.0, 0.3
 LEAST_SEEN = 32  # samples between the lids: a narrower eye teaches nothing
 LEARNED = 400  # frames, spread over the clip, that tell the greys
-# An iris has a radius of 5.9 mm (sd .2); the head's size is not known as well. Half of what the clip tells beside it.
-RADIUS_MM, RADIUS_SHARE = 6.1, 0.5
-RADII_MM = np.arange(4.6, 8.1, 0.4)
-SURELY_IRIS_MM, SURELY_NOT_MM = 3.5, 7.5  # from its middle, before its radius is known
-MARGIN_MM = 1.2  # of that radius, later
+# An iris has a radius of 5.9 mm (sd .2), but heads are not as large as they are taken to be. Taken from the clip itself
+# it tells no more.
+RADIUS_MM = 6.1
+MARGIN_MM = 1.2  # of that radius; farther inside lies iris for sure, farther outside none
 BINS, RANGE, RARE = 40, 2.5, 0.01  # of the logarithm of a grey level about the eye's median; share never seen
 TRUSTED = 2.0  # the most that one sample counts, as log likelihood ratio
 ROUNDS = 2  # in which the irises found teach the greys
 PER_MM2 = 0.6  # of that ratio: neighbours err together
 REACH_MM, PRIOR_MM = 3.0, 1.0  # of an iris from where the landmarker sees it: at most, and standard deviation
-APART_MM = 0.8  # standard deviation between what is found of both eyes: they turn together
+# Standard deviation between what is found of both eyes, which turn together; how often one of them is led astray.
+APART_MM, ASTRAY = 0.8, 0.001
 SHIFTS = np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM)
 
 
@@ -96,17 +96,15 @@ def iris_shifts(greys: U8, seen: NDArray[np.bool_], sound: Index) -> F64:
     learned = usable[np.unique(np.linspace(0, len(usable) - 1, LEARNED).round().astype(int))]
     bins, taught = _bins(greys[learned], seen[learned]), seen[learned]
     places, usual = np.zeros((len(learned), 2, 2)), np.zeros((2, 2))
-    known = _likelihood_ratios(bins, taught, places, SURELY_IRIS_MM, SURELY_NOT_MM)
-    radius = _radius(_told(known, bins, taught))
     for _ in range(ROUNDS):
-        known = _likelihood_ratios(bins, taught, places, radius - MARGIN_MM, radius + MARGIN_MM)
-        found = _places(_told(known, bins, taught), radius, usual)
+        known = _likelihood_ratios(bins, taught, places)
+        found = _places(_told(known, bins, taught), usual)
         usual = np.median(found, axis=0)
         places = found - usual
 
     def shifts(rows: Index) -> F64:
         told = _told(known, _bins(greys[rows], seen[rows]), seen[rows])
-        return _places(told, radius, usual) - usual
+        return _places(told, usual) - usual
 
     parts = np.array_split(np.arange(len(greys)), max(1, len(greys) // LEARNED))
     return np.concatenate(list(side_by_side(shifts, parts)))
@@ -135,15 +133,16 @@ def _bins(greys: U8, seen: NDArray[np.bool_]) -> U8:
     return np.clip((log - usual + RANGE) * (BINS / (2 * RANGE)), 0, BINS - 1).astype(np.uint8)
 
 
-def _likelihood_ratios(bins: U8, seen: NDArray[np.bool_], places: F64, near: float, far: float) -> F32:
+def _likelihood_ratios(bins: U8, seen: NDArray[np.bool_], places: F64) -> F32:
     """[2, BINS] how much likelier a grey is in an iris than beside it, as logarithms, for each eye.
 
-    places: [m, 2, 2] mm, the irises' middles; nearer than `near` lies iris, farther than `far` none.
+    places: [m, 2, 2] mm, the irises' middles.
     """
     away = np.hypot(*(field - places[..., k, None, None] for k, field in enumerate((FAR_X, FAR_Y))))
     tables = np.empty((2, 2, BINS))
     for eye in range(2):
-        for side, which in enumerate((away[:, eye] < near, away[:, eye] > far)):
+        surely = (away[:, eye] < RADIUS_MM - MARGIN_MM, away[:, eye] > RADIUS_MM + MARGIN_MM)
+        for side, which in enumerate(surely):
             count = np.bincount(bins[:, eye][seen[:, eye] & which], minlength=BINS)
             smooth = gaussian_filter1d(count.astype(np.float64), 1.0)
             tables[side, eye] = np.log(smooth / max(smooth.sum(), 1e-9) + RARE / BINS)
@@ -155,34 +154,25 @@ def _told(ratios: F32, bins: U8, seen: NDArray[np.bool_]) -> F32:
     return np.stack([ratios[eye][bins[:, eye]] for eye in range(2)], axis=1) * seen
 
 
-def _radius(told: F32) -> float:
-    """mm, of discs about the landmarker's irises that hold most of what says that it lies in one; half of the way."""
-    away = np.hypot(FAR_X, FAR_Y)
-    held = np.array([(told * (away < radius)).sum() for radius in RADII_MM])
-    best = float(RADII_MM[held.argmax()])
-    return RADIUS_MM + RADIUS_SHARE * (best - RADIUS_MM)
-
-
-def _places(told: F32, radius: float, usual: F64) -> F64:
+def _places(told: F32, usual: F64) -> F64:
     """[m, 2, 2] mm across and down: the expectation over all places of a disc's middle, of both eyes together.
 
     Under what the samples say [m, 2, H, W], and a prior about where irises usually lie, [2, 2] mm.
     """
-    reach = np.arange(-np.ceil(radius / STEP_MM), np.ceil(radius / STEP_MM) + 1) * STEP_MM
-    disc = np.clip((radius - np.hypot(*np.meshgrid(reach, reach))) / STEP_MM + 0.5, 0, 1).astype(np.float32)
+    reach = np.arange(-np.ceil(RADIUS_MM / STEP_MM), np.ceil(RADIUS_MM / STEP_MM) + 1) * STEP_MM
+    disc = np.clip((RADIUS_MM - np.hypot(*np.meshgrid(reach, reach))) / STEP_MM + 0.5, 0, 1).astype(
+        np.float32
+    )
     x, y = np.meshgrid(SHIFTS, SHIFTS)
     prior = [np.exp(-((x - mean[0]) ** 2 + (y - mean[1]) ** 2) / (2 * PRIOR_MM**2)) for mean in usual]
     middle = np.ix_(np.abs(DOWN) <= REACH_MM, np.abs(ACROSS) <= REACH_MM)
     out = np.empty((len(told), 2, 2))
     for row, eyes in enumerate(told):
-        value = [cv2.filter2D(eye, -1, disc, borderType=cv2.BORDER_CONSTANT)[middle] for eye in eyes]
+        value = [cv2.filter2D(eye, cv2.CV_64F, disc, borderType=cv2.BORDER_CONSTANT)[middle] for eye in eyes]
         likely = [np.exp(PER_MM2 * STEP_MM**2 * (own - own.max())) for own in value]
         # Where the other eye is found, this one is expected.
-        near = [
-            cv2.GaussianBlur(own, (0, 0), APART_MM / STEP_MM, borderType=cv2.BORDER_REPLICATE)
-            for own in likely
-        ]
+        near = [cv2.GaussianBlur(own, (0, 0), APART_MM / STEP_MM) for own in likely]
         for eye in range(2):
-            share = likely[eye] * near[1 - eye] * prior[eye]
+            share = likely[eye] * (near[1 - eye] + ASTRAY) * prior[eye]
             out[row, eye] = (share * x).sum() / share.sum(), (share * y).sum() / share.sum()
     return out
