@@ -30,13 +30,10 @@ FAR_X, FAR_Y = np.meshgrid(ACROSS, DOWN)
 BELOW_UPPER_MM, ABOVE_LOWER_MM = 2.0, 0.3
 LEAST_SEEN = 32  # samples between the lids: a narrower eye teaches nothing
 LEARNED = 400  # frames, spread over the clip, that tell the greys
-# An iris has a radius of 5.9 mm (sd .2), but heads are not as large as they are taken to be. Taken from the clip itself
-# it tells no more.
-RADIUS_MM = 6.1
+RADIUS_MM = 5.8  # of an iris: 5.9 (sd .2), but heads are not as large as they are taken to be
 MARGIN_MM = 1.2  # of that radius; farther inside lies iris for sure, farther outside none
 BINS, RANGE, RARE = 40, 2.5, 0.01  # of the logarithm of a grey level about the eye's median; share never seen
 TRUSTED = 2.0  # the most that one sample counts, as log likelihood ratio
-ROUNDS = 2  # in which the irises found teach the greys
 PER_MM2 = 0.6  # of that ratio: neighbours err together
 REACH_MM, PRIOR_MM = 3.0, 1.0  # of an iris from where the landmarker sees it: at most, and standard deviation
 # Standard deviation between what is found of both eyes, which turn together; how often one of them is led astray.
@@ -95,12 +92,8 @@ def iris_shifts(greys: U8, seen: NDArray[np.bool_], sound: Index) -> F64:
         return np.zeros((len(greys), 2, 2))
     learned = usable[np.unique(np.linspace(0, len(usable) - 1, LEARNED).round().astype(int))]
     bins, taught = _bins(greys[learned], seen[learned]), seen[learned]
-    places, usual = np.zeros((len(learned), 2, 2)), np.zeros((2, 2))
-    for _ in range(ROUNDS):
-        known = _likelihood_ratios(bins, taught, places)
-        found = _places(_told(known, bins, taught), usual)
-        usual = np.median(found, axis=0)
-        places = found - usual
+    known = _likelihood_ratios(bins, taught)
+    usual = np.median(_places(_told(known, bins, taught), np.zeros((2, 2))), axis=0)
 
     def shifts(rows: Index) -> F64:
         told = _told(known, _bins(greys[rows], seen[rows]), seen[rows])
@@ -133,17 +126,16 @@ def _bins(greys: U8, seen: NDArray[np.bool_]) -> U8:
     return np.clip((log - usual + RANGE) * (BINS / (2 * RANGE)), 0, BINS - 1).astype(np.uint8)
 
 
-def _likelihood_ratios(bins: U8, seen: NDArray[np.bool_], places: F64) -> F32:
+def _likelihood_ratios(bins: U8, seen: NDArray[np.bool_]) -> F32:
     """[2, BINS] how much likelier a grey is in an iris than beside it, as logarithms, for each eye.
 
-    places: [m, 2, 2] mm, the irises' middles.
+    As the landmarker has them, which is about right.
     """
-    away = np.hypot(*(field - places[..., k, None, None] for k, field in enumerate((FAR_X, FAR_Y))))
+    away = np.hypot(FAR_X, FAR_Y)
     tables = np.empty((2, 2, BINS))
-    for eye in range(2):
-        surely = (away[:, eye] < RADIUS_MM - MARGIN_MM, away[:, eye] > RADIUS_MM + MARGIN_MM)
-        for side, which in enumerate(surely):
-            count = np.bincount(bins[:, eye][seen[:, eye] & which], minlength=BINS)
+    for side, surely in enumerate((away < RADIUS_MM - MARGIN_MM, away > RADIUS_MM + MARGIN_MM)):
+        for eye in range(2):
+            count = np.bincount(bins[:, eye][seen[:, eye] & surely], minlength=BINS)
             smooth = gaussian_filter1d(count.astype(np.float64), 1.0)
             tables[side, eye] = np.log(smooth / max(smooth.sum(), 1e-9) + RARE / BINS)
     return np.clip(tables[0] - tables[1], -TRUSTED, TRUSTED).astype(np.float32)
