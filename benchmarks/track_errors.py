@@ -182,7 +182,7 @@ def eye_errors(
 ) -> dict[str, float]:
     """RMSE about the mean of how far the lids are apart, and mean angle about the mean of where eyes look while open.
 
-    NaN where the truth knows neither.
+    NaN unless the truth knows both lids and eyes.
     """
     if truth.vertices is None or truth.eyes is None:
         return {"lids_mm": np.nan, "gaze_deg": np.nan}

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from tracker.landmark_indices import IRIS_CENTRES, LEFT_EYE_OUTER, RIGHT_EYE_OUTER
-from tracker.lip_lines import LOG, sampled
 from tracker.threads import side_by_side
 from tracker.track import F32, F64
-from tracker.view import U8, Index
+from tracker.view import LOG, U8, Index, sampled
 
 # Lids from the outer corner to the inner one, of the left eye and then of the right, as IRIS_CENTRES has them.
 UPPER_LIDS = ((263, 466, 388, 387, 386, 385, 384, 398, 362), (33, 246, 161, 160, 159, 158, 157, 173, 133))

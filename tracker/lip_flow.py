@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.lip_lines import SAMPLES, LipLines, sampled
+from tracker.lip_lines import SAMPLES, LipLines
 from tracker.lip_motion import STRETCH, Motion
 from tracker.track import F32, F64
-from tracker.view import U8
+from tracker.view import U8, sampled
 
 F16 = NDArray[np.float16]
 

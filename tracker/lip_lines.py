@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from tracker.energy import LIP_PAIRS, rotation_matrix
 from tracker.track import F64
-from tracker.view import U8
+from tracker.view import LOG, U8, sampled
 
 # Outer edges of the upper and the lower lip above and below each pair of the inner ones.
 OUTER_PAIRS = (
@@ -18,12 +17,8 @@ OUTER_PAIRS = (
 )
 STEP_MM, REACH_MM = 0.4, 17.0  # of the samples along a line, to both sides of the inner lips' middle
 SAMPLES = np.arange(-REACH_MM, REACH_MM + STEP_MM / 2, STEP_MM)
-# Of a grey level: light becomes a sum. Where it is dark, colours are noise.
-LOG = np.log(np.arange(256, dtype=np.float32) + np.float32(8.0))
 FINE_REACH_MM = 12.0
 FLAT = 1e-5  # of squared LOG: two faces behind fog that leaves a third of the contrast have .001
-BLUR = 0.6  # standard deviation in steps, and no less than LEAST_BLUR_PX
-LEAST_BLUR_PX = 0.5
 
 
 @dataclass(frozen=True)
@@ -54,10 +49,8 @@ class LipLines:
 
     def read(self, rgb: U8, row: int) -> U8:
         """[Q, S, 3] u8: the colours of a picture [H, W, 3] along the lines of frame `row`."""
-        px_per_mm = float(np.linalg.norm(self.step[row]))
-        return sampled(
-            rgb, self.middle[row][:, None] + SAMPLES[:, None] * self.step[row], STEP_MM * px_per_mm
-        )
+        places = self.middle[row][:, None] + SAMPLES[:, None] * self.step[row]
+        return sampled(rgb, places, STEP_MM * float(np.linalg.norm(self.step[row])))
 
     def widths(self, observed: F64) -> F64:
         """[n, Q] mm, how far apart landmarks [n, 478, 2] px have the inner lips."""
@@ -73,16 +66,6 @@ class LipLines:
         out[:, upper] -= move
         out[:, lower] += move
         return out
-
-
-def sampled(rgb: U8, places: F64, apart: float) -> U8:
-    """[.., 3] u8: the colours of a picture [H, W, 3] at places [.., 2] px that lie so many px apart."""
-    size = np.array(rgb.shape[1::-1])
-    low = np.clip(np.floor(places.min((0, 1))).astype(int) - 4, 0, size - 1)
-    high = np.clip(np.ceil(places.max((0, 1))).astype(int) + 5, low + 1, size)
-    part = cv2.GaussianBlur(rgb[low[1] : high[1], low[0] : high[0]], (0, 0), max(BLUR * apart, LEAST_BLUR_PX))
-    x, y = np.moveaxis((places - low).astype(np.float32), 2, 0)
-    return cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def fineness(colours: U8) -> float:

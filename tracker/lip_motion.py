@@ -15,10 +15,10 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from tracker.lip_lines import LOG, SAMPLES, STEP_MM
+from tracker.lip_lines import SAMPLES, STEP_MM
 from tracker.threads import THREADS, side_by_side
 from tracker.track import F64, STEP_S
-from tracker.view import U8
+from tracker.view import LOG, U8
 
 # Time between frames in which motion is looked for (the farther apart, the less errors add up), and frames at most.
 LONGEST_S, MOST_APART = 0.35, 64

@@ -14,10 +14,10 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from tracker.lip_lines import LOG, SAMPLES, STEP_MM
+from tracker.lip_lines import SAMPLES, STEP_MM
 from tracker.threads import side_by_side
 from tracker.track import F32, F64
-from tracker.view import U8, Index
+from tracker.view import LOG, U8, Index
 
 BINS = 20  # of each of three axes of colour
 LEAST_RANGE = 0.1  # of log colour along an axis: below, it is noise

@@ -19,6 +19,20 @@ Rows = slice | Sequence[int] | Index
 
 LARGEST = 2.0  # times the usual face: all windows are as large, and for a frame or two memory is not to grow
 MARGIN = 1.15  # of the extent of the face's landmarks
+# Of a grey level: light becomes a sum. Where it is dark, colours are noise.
+LOG = np.log(np.arange(256, dtype=np.float32) + np.float32(8.0))
+BLUR = 0.6  # standard deviation in times of how far samples lie apart, and no less than LEAST_BLUR_PX
+LEAST_BLUR_PX = 0.5
+
+
+def sampled(rgb: U8, places: F64, apart: float) -> U8:
+    """[.., 3] u8: the colours of a picture [H, W, 3] at places [.., 2] px that lie so many px apart."""
+    size = np.array(rgb.shape[1::-1])
+    low = np.clip(np.floor(places.min((0, 1))).astype(int) - 4, 0, size - 1)
+    high = np.clip(np.ceil(places.max((0, 1))).astype(int) + 5, low + 1, size)
+    part = cv2.GaussianBlur(rgb[low[1] : high[1], low[0] : high[0]], (0, 0), max(BLUR * apart, LEAST_BLUR_PX))
+    x, y = np.moveaxis((places - low).astype(np.float32), 2, 0)
+    return cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 @dataclass(frozen=True)
