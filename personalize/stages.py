@@ -224,7 +224,7 @@ class Judge(Stage):
 class Overlay(Stage):
     """The track over the video, to check by eye."""
 
-    name, version, reads = "overlay", 4, ("overlay",)
+    name, version, reads = "overlay", 5, ("overlay",)
     needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", *JUDGED)
     makes, products = ("contact_sheet.png", "preview.mp4"), ("overlay.mp4",)
 

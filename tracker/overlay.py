@@ -15,7 +15,7 @@ from tracker.scene import U8, Scene
 
 MODES = {
     "shaded": "the fitted surface in clay",
-    "wireframe": "its edges, with the lines where the lips and the lids meet",
+    "wireframe": "its edges, with the lines where the lips and the lids meet, and the irises",
     "albedo": "the face re-rendered: the subject's colours in the light of each frame",
     "error": "how far that is from the picture, in grey levels",
     "landmarks": "detected points in green, each joined to its fitted one in red",
@@ -24,7 +24,7 @@ NEEDS_ALBEDO = ("albedo", "error")
 
 MESH_OPACITY, EDGE_OPACITY = 0.5, 0.5
 CLAY = (196, 178, 168)
-EDGES, LIPS, LIDS = (120, 220, 255), (255, 60, 60), (255, 225, 60)
+EDGES, LIPS, LIDS, IRISES = (120, 220, 255), (255, 60, 60), (255, 225, 60), (120, 255, 120)
 DETECTED, FITTED = (70, 235, 90), (255, 60, 60)
 WHITE = (240, 240, 240)
 SUBPIXEL = 4  # bits: a sixteenth of a pixel, so that a wrong half pixel would be seen
@@ -73,7 +73,21 @@ def _wireframe(scene: Scene, head: HeadModel) -> U8:
         for side in ("upper", "lower"):
             if (name := f"{part}_{side}") in head.regions:
                 _lines(drawn, scene.pixels[None, head.regions[name]], colour, closed=False)
+    for side in ("left", "right"):
+        if f"{side}_iris" in head.regions and f"{side}_eyelid_upper" in head.regions:
+            _iris(drawn, scene, head, side)
     return drawn
+
+
+def _iris(drawn: U8, scene: Scene, head: HeadModel, side: str) -> None:
+    """Line an iris where it is seen between the lids, whose rims both run from one corner to the other."""
+    upper, lower = (scene.pixels[head.regions[f"{side}_eyelid_{lid}"]] for lid in ("upper", "lower"))
+    between = np.zeros(drawn.shape[:2], np.uint8)
+    cv2.fillPoly(between, [_fine(np.concatenate([upper, lower[::-1]]))], 1, cv2.LINE_8, SUBPIXEL)
+    lined = drawn.copy()
+    ring = cv2.convexHull(scene.pixels[head.regions[f"{side}_iris"], :2])
+    _lines(lined, ring.reshape(1, -1, 2), IRISES, closed=True)
+    cv2.copyTo(lined, between, drawn)
 
 
 def _albedo(scene: Scene, rendering: Rendering) -> U8:

@@ -13,7 +13,7 @@ from tests.tracker.turning_head import SIZE, first_hits, picture, shifted_landma
 from tracker.albedo import Rendering, _seen, learn_albedo, rerender
 from tracker.flame import flame_head
 from tracker.head import HeadModel, load_head
-from tracker.overlay import DETECTED, FITTED, LIDS, LIPS, MODES, NEEDS_ALBEDO, draw
+from tracker.overlay import DETECTED, FITTED, IRISES, LIDS, LIPS, MODES, NEEDS_ALBEDO, draw
 from tracker.raster import vertex_normals
 from tracker.scene import OUTSIDE, Crop, Scene, place, scene
 from tracker.track import Landmarks, Track
@@ -196,6 +196,32 @@ def test_lips_and_both_lids_are_lined(
             x, y = np.round(scenes[-1].pixels[head.regions[f"{name}_{side}"], :2]).astype(int).T
             near = np.stack([drawn[y + j, x + i] for i in (-1, 0, 1) for j in (-1, 0, 1)])
             assert np.median(np.abs(near - colour).sum(-1).min(0)) < 120
+
+
+def test_irises_are_lined_between_the_lids_and_turn_with_the_eyes(
+    track: Track, landmarks: Landmarks, head: HeadModel
+) -> None:
+    def lined(turn: float, name: str = "") -> np.ndarray:
+        """[n, 2] px, (x, y) of what is lined of the left iris."""
+        weights, eyes = track.expression.copy(), np.zeros_like(track.eyes)
+        eyes[..., 1] = turn
+        if name:
+            weights[0, head.expression_names.index(name)] = 1.0
+        posed = replace(track, expression=weights, eyes=eyes)
+        one = scene(picture(track, head, 0), WHOLE, posed, 0, landmarks, head)
+        drawn = draw(one, "wireframe", head, None).astype(int)
+        x, y, width, height = cv2.boundingRect(one.pixels[head.regions["left_iris"], :2])
+        return np.argwhere(np.abs(drawn[y : y + height, x : x + width] - IRISES).sum(-1) < 90)[:, ::-1] + (
+            x,
+            y,
+        )
+
+    straight, aside, shut = lined(0.0), lined(0.3), lined(0.0, "eyeBlinkLeft")
+    assert len(straight) > 15 and len(shut) < 4
+    assert aside[:, 0].mean() - straight[:, 0].mean() > 2
+    lids = scene(picture(track, head, 0), WHOLE, track, 0, landmarks, head).pixels
+    upper, lower = (lids[head.regions[f"left_eyelid_{lid}"], 1] for lid in ("upper", "lower"))
+    assert upper.min() - 1 < straight[:, 1].min() and straight[:, 1].max() < lower.max() + 1
 
 
 def test_what_the_face_itself_hides_has_no_colour(
