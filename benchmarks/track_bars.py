@@ -14,7 +14,7 @@ PHOTOMETRIC = ("opening_centred_mm", "rotation_deg", "jitter_mm")
 # A face that stands still has next to none of these, and would lower their means or, by nothing, be called worse.
 OF_MOTION = (
     *("lip_motion_mm", "lip_in_plane_mm", "lip_neutral_mm"),
-    *("opening_rmse_mm", "opening_centred_mm", "rotation_deg"),
+    *("opening_rmse_mm", "opening_centred_mm", "rotation_deg", "lids_mm", "gaze_deg"),
 )
 STILL_MM = 0.05
 RAISED = 0.01  # as a share; less is a tie
@@ -80,6 +80,8 @@ BARS = (
     Bar("out of model: focal of turning heads, %", OUTSIDE, "turning_focal_pct", 10.0, worst=True),
     Bar("out of model: surface, mm", OUTSIDE, "surface_mm", 1.4),
     Bar("out of model: surface against the mean head's, %", OUTSIDE, "surface_pct", 85.0),
+    Bar("out of model: lids about their mean, mm", OUTSIDE, "lids_mm", 0.3),
+    Bar("out of model: gaze, degrees", OUTSIDE, "gaze_deg", 1.5),
     Bar("closures within one frame, share", FILMS, "closures", 0.95, at_least=True),
     Bar("still face, rms of face vertices, mm", FILMS, "still_mm", 0.1, worst=True),
     Bar("frames to recover", FILMS, "recovery_frames", 3.0, worst=True),

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from tracker.landmark_indices import IRIS_CENTRES, LEFT_EYE_OUTER, RIGHT_EYE_OUTER
+from tracker.landmark_indices import IRIS_CENTRES, LEFT_EYE, LEFT_EYE_OUTER, RIGHT_EYE, RIGHT_EYE_OUTER
 from tracker.threads import side_by_side
 from tracker.track import F32, F64
 from tracker.view import LOG, U8, Index, sampled
 
-# Lids from the outer corner to the inner one, of the left eye and then of the right, as IRIS_CENTRES has them.
-UPPER_LIDS = ((263, 466, 388, 387, 386, 385, 384, 398, 362), (33, 246, 161, 160, 159, 158, 157, 173, 133))
-LOWER_LIDS = ((263, 249, 390, 373, 374, 380, 381, 382, 362), (33, 7, 163, 144, 145, 153, 154, 155, 133))
+# Lids from the outer corner to the inner one, of both eyes as IRIS_CENTRES has them.
+LOWER_LIDS = [eye[:9] for eye in (LEFT_EYE, RIGHT_EYE)]
+UPPER_LIDS = [(eye[0], *eye[9:], eye[8]) for eye in (LEFT_EYE, RIGHT_EYE)]
 # What is looked at about an iris as the landmarker sees it: every half of a millimetre.
 STEP_MM = 0.5
 ACROSS, DOWN = np.arange(-11.0, 11.1, STEP_MM), np.arange(-9.0, 9.1, STEP_MM)

@@ -36,9 +36,7 @@ EDGE_MM, EDGE_SHARE = 0.1, 0.25
 MOVED_MM, MOVED_SHARE = 0.1, 0.2
 DOUBT_MM = 1.0  # by which edges and motion disagree where the motion counts half
 
-
-# By frames apart: [n - apart, Q] mm by which the widths of n frames grow until then.
-Motion = dict[int, F64]
+Motion = dict[int, F64]  # by frames apart: [n - apart, Q] mm by which the widths of n frames grow until then
 
 
 def links(time: F64) -> list[int]:
