@@ -19,6 +19,7 @@ from personalize.shots import (
     CUT_WINDOW_S,
     F32,
     F64,
+    FACE_JUMPS,
     MAX_GAP_S,
     MIN_SHOT_S,
     MOST_WINDOW,
@@ -142,7 +143,7 @@ def find_usable(media: MediaInfo, progress: Progress = None) -> tuple[Frames, li
     looked = _looked_through(media, progress)
     time, again = looked.time, looked.again
     _check_rate(media, time[~again])
-    segment = find_shots(time, looked.change)
+    segment = find_shots(time, looked.change, looked.face)
     mine, others = main_person([shot for face in looked.faces for shot in face.shots(segment)])
     _check_upright(media, mine, looked.turns)
     total = len(time)
@@ -212,12 +213,14 @@ def _check_upright(media: MediaInfo, person: list[Tracklet], turns: list[F64]) -
 class _Seen:
     """What one pass over the pictures shows.
 
-    time: [T] s. change: [T], how much each differs from the last. again: [T] repeated. corrupt: [T] damaged. faces:
-    all, in px of pictures of at most SEARCH_SIDE. turns: `sureness_of_turns` of some. reader: at its end.
+    time: [T] s. change, face: [T], how much each differs from the last, see `find_shots`. again: [T] repeated. corrupt:
+    [T] damaged. faces: all, in px of pictures of at most SEARCH_SIDE. turns: `sureness_of_turns` of some. reader: at
+    its end.
     """
 
     time: F64
     change: F64
+    face: F64
     again: Bool
     corrupt: Bool
     faces: list[Tracklet]
@@ -229,20 +232,22 @@ def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
     landmarker = FaceLandmarker()
     reader, follower = FrameReader(media.path, SEARCH_SIDE), FaceFollower(landmarker)
     expected = max(1, round(media.duration_s * media.fps))
-    recent = deque[float](maxlen=min(max(3, round(CUT_WINDOW_S * media.fps)), MOST_WINDOW))
+    recent = deque[tuple[float, float]](maxlen=min(max(3, round(CUT_WINDOW_S * media.fps)), MOST_WINDOW))
     changes, rows, turns, next_look = Changes(), [], list[F64](), 0.0
     for index, (time, rgb) in enumerate(reader):
-        whole, near = changes.next(rgb, follower.boxes)
-        rows.append((time, whole, near, reader.damaged))
+        whole, near, face = changes.next(rgb, follower.boxes, follower.widest)
+        rows.append((time, whole, near, face, reader.damaged))
         gap = len(rows) > 1 and time - rows[-2][0] > MAX_GAP_S
-        follower.add(index, time, rgb, gap or sudden(near[0], recent))
-        recent.append(near[0])
+        pictures, faces = zip(*recent) if recent else ((), ())
+        cut = sudden(near[0], pictures) or sudden(face, faces, FACE_JUMPS)
+        follower.add(index, time, rgb, gap or cut)
+        recent.append((near[0], face))
         if follower.widest is not None and time >= next_look:
             next_look = time + TURN_S
             turns.append(sureness_of_turns(landmarker, rgb, follower.widest))
         if progress is not None:
             progress(min(len(rows), expected), expected)
-    times, whole_views, near_views, damaged = zip(*rows)
+    times, whole_views, near_views, above_mouth, damaged = zip(*rows)
     # Once for the clip: two measures side by side would look like motion and rest.
     widths: list[list[float]] = [[] for _ in times]
     for sighting in (sighting for face in follower.tracklets for sighting in face.sightings):
@@ -254,7 +259,9 @@ def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
     of_repeats = near_views if narrowest < NEARLY_SMALL * SMALL_FACE else whole_views
     at, differences = np.array(times), np.array([change for change, _ in of_cuts])
     again = repeated(at, *(np.array(column) for column in zip(*of_repeats)))
-    return _Seen(at, differences, again, np.array(damaged), follower.tracklets, turns, reader)
+    return _Seen(
+        at, differences, np.array(above_mouth), again, np.array(damaged), follower.tracklets, turns, reader
+    )
 
 
 def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:

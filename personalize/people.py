@@ -112,11 +112,12 @@ class FaceFollower:
     def __init__(self, landmarker: FaceLandmarker) -> None:
         self._landmarker = landmarker
         self._open: list[Tracklet] = []
-        self._searched = -np.inf
+        self._searched, self._latest = -np.inf, -1
         self.tracklets: list[Tracklet] = []
 
     def add(self, index: int, time: float, rgb: U8, sudden: bool = False) -> None:
         """Look at the next picture [H, W, 3]. sudden: there may be a cut before it, and every face another one."""
+        self._latest = index
         if sudden:
             for followed in self._open:
                 followed.next_sample = time
@@ -152,9 +153,10 @@ class FaceFollower:
 
     @property
     def widest(self) -> F32 | None:
-        """[4] px, where the widest face that is being followed was last seen; a photograph's if there is no other."""
-        boxes = [followed.box for followed in self._open if not followed.still] or self.boxes
-        return max(boxes, key=lambda box: float(box[2] - box[0]), default=None)
+        """[4] px, the widest face in the last picture; a photograph's if there is no other, None without any."""
+        seen = [followed for followed in self._open if followed.frames[-1] == self._latest]
+        faces = [face for face in seen if not face.still] or seen
+        return max((face.box for face in faces), key=lambda box: float(box[2] - box[0]), default=None)
 
     def _find(self, time: float, rgb: U8) -> list[Face]:
         detector = self._landmarker.detector

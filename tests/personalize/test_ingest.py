@@ -71,13 +71,14 @@ def test_how_closely_is_looked_is_decided_once_for_a_clip(
     looked: list[np.ndarray] = []
     monkeypatch.setattr(
         "personalize.ingest.Changes",
-        lambda: Mock(next=lambda rgb, faces: ((1.0, False), (5.0, False))),
+        lambda: Mock(next=lambda rgb, faces, widest: ((1.0, False), (5.0, False), np.nan)),
     )
     monkeypatch.setattr(
         "personalize.ingest.repeated", lambda time, change, same: looked.append(change) or same
     )
     monkeypatch.setattr(
-        "personalize.ingest.find_shots", lambda time, change: looked.append(change) or np.zeros(60, np.int32)
+        "personalize.ingest.find_shots",
+        lambda time, change, face: looked.append(change) or np.zeros(60, np.int32),
     )
     for width, repeats, cuts in ((9.0, 5.0, 5.0), (12.0, 5.0, 1.0), (24.0, 1.0, 1.0)):  # of 96 px
         face = tracklet(1, range(60))
@@ -96,7 +97,7 @@ def test_how_closely_is_looked_is_decided_once_for_a_clip(
 
 def test_broken_time_stamps_take_no_more_memory_than_whole_ones() -> None:
     time = np.arange(3000) / 90_000
-    assert find_shots(time, np.ones(3000)).max() == 0
+    assert find_shots(time, np.ones(3000), np.ones(3000)).max() == 0
     assert not repeated(time, np.ones(3000), np.zeros(3000, bool)).any()
 
 
@@ -279,7 +280,8 @@ def seen_as(faces: list[Tracklet], time: np.ndarray, **marks: np.ndarray) -> _Se
     """What a pass over pictures at `time` [T] s shows where these faces are; marks: as of `_Seen`."""
     nothing = np.zeros(len(time), bool)
     reader = SimpleNamespace(resized_s=np.nan, interlaced=0)
-    rest = {"change": np.ones(len(time)), "again": nothing, "corrupt": nothing} | marks
+    still, unseen = np.ones(len(time)), np.full(len(time), np.nan)
+    rest = {"change": still, "face": unseen, "again": nothing, "corrupt": nothing} | marks
     return _Seen(time=time, faces=faces, turns=[], reader=cast(FrameReader, reader), **rest)
 
 

@@ -191,6 +191,9 @@ def test_the_widest_face_is_no_photograph_unless_it_is_alone() -> None:
     detector.whole = [photograph]
     follow(detector, range(121, 150), follower)
     assert follower.widest.tolist() == photograph.box.tolist()
+    detector.whole = []
+    follow(detector, range(150, 151), follower)
+    assert follower.widest is None and follower.boxes  # followed on, but not seen
 
 
 def test_behind_a_cut_a_face_is_looked_at_anew_however_shortly_it_is_seen() -> None:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from personalize.shots import (
+    CUT_RATIO,
+    FACE_JUMPS,
     Changes,
     difference,
     find_shots,
@@ -18,16 +20,50 @@ from personalize.split import make_split
 from tests.personalize.people_factory import frames_of
 
 
+def cuts(time: np.ndarray, change: np.ndarray, face: np.ndarray | None = None) -> list[int]:
+    """First frames of shots behind the first one. face: none is seen where it is not given."""
+    shots = find_shots(time, change, np.full(len(time), np.nan) if face is None else face)
+    return (np.flatnonzero(np.diff(shots)) + 1).tolist()
+
+
 def test_a_cut_is_found_where_the_change_stands_out() -> None:
     change = 0.5 + 0.2 * np.sin(np.arange(100.0))
     change[[30, 33, 70]] = 8.0
-    shots = find_shots(np.arange(100) / 25, change)
-    assert list(np.flatnonzero(np.diff(shots)) + 1) == [30, 33, 70]
+    assert cuts(np.arange(100) / 25, change) == [30, 33, 70]
 
 
 def test_steady_strong_motion_is_no_cut() -> None:
     change = np.random.default_rng(0).uniform(4, 8, 200)
-    assert find_shots(np.arange(200) / 25, change).max() == 0
+    assert not cuts(np.arange(200) / 25, change, change)
+
+
+def test_what_comes_beside_a_face_is_no_cut_and_a_face_that_jumps_is_one() -> None:
+    time, change, face = np.arange(200) / 25, np.full(200, 0.4), np.full(200, 1.2)
+    captions = np.arange(10, 200, 10)
+    change[captions] = 9.0
+    assert cuts(time, change) == captions.tolist()
+    assert not cuts(time, change, face)
+    face[[50, 60]] = np.nan  # it is not seen for a moment: nobody knows
+    assert cuts(time, change, face) == [50, 60]
+    face[[70, 133, 160]] = 9.0, 9.0, 4.0  # with a caption, without one, and a nod
+    assert cuts(time, change, face) == [50, 60, 70, 133, 160]
+    assert cuts(time, np.full(200, 0.4), face) == [70, 133]
+
+
+def test_a_face_changes_by_what_is_seen_above_its_mouth() -> None:
+    random = np.random.default_rng(0)
+    picture = random.integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    box = np.array([200, 100, 400, 300], np.float32)
+    captioned, other, moved = picture.copy(), picture.copy(), np.roll(picture, 90, axis=1)
+    captioned[225:330] = 255
+    other[60:215, 185:415] = random.integers(0, 60, (155, 230, 3))
+    for shown, least, most in ((picture, 0, 0), (captioned, 0, 0), (other, 60, 120), (moved, 5, 60)):
+        changes = Changes()
+        assert np.isnan(changes.next(picture, [], box)[2])
+        (whole, _), _, face = changes.next(shown, [], box)
+        assert least <= face <= most and (shown is not captioned or whole > 10)
+        assert np.isnan(changes.next(picture, [], None)[2])
+        assert np.isnan(changes.next(picture, [], box + 900)[2])
 
 
 def test_a_missing_second_ends_a_shot_and_a_dropped_frame_does_not() -> None:
@@ -35,7 +71,7 @@ def test_a_missing_second_ends_a_shot_and_a_dropped_frame_does_not() -> None:
     time = np.delete(time, 40)
     change = np.full(len(time), 1.0)
     change[40] = 4.0  # two steps at once
-    assert list(np.flatnonzero(np.diff(find_shots(time, change))) + 1) == [25]
+    assert cuts(time, change) == cuts(time, np.ones(len(time)), change) == [25]
 
 
 def test_a_repeated_picture_is_seen_and_a_small_motion_is_not_one() -> None:
@@ -50,22 +86,25 @@ def test_a_small_face_that_moves_in_a_still_picture_repeats_nothing() -> None:
     moved, face = screen.copy(), np.array([1100, 600, 1130, 640], np.float32)
     moved[628:631, 1112:1116] ^= 31  # a mouth
     changes = Changes()
-    assert changes.next(screen, [face]) == ((0.0, False), (0.0, False))
-    (whole, same), (near, alike) = changes.next(moved, [face])
+    assert changes.next(screen, [face], None)[:2] == ((0.0, False), (0.0, False))
+    (whole, same), (near, alike), _ = changes.next(moved, [face], None)
     assert same and not alike and near > 10 * whole
     near_face = near
-    assert changes.next(moved, [face]) == ((0.0, True), (0.0, True))
+    assert changes.next(moved, [face], None)[:2] == ((0.0, True), (0.0, True))
     # What changes elsewhere counts as well: another slide, of which the still face sees nothing.
     slide = moved.copy()
     slide[:300, :600] = 255
-    other, (near, alike) = changes.next(slide, [face])
+    other, (near, alike), _ = changes.next(slide, [face], None)
     assert (near, alike) == other and near > 10 and not alike
-    changes.next(moved, [face])
+    changes.next(moved, [face], None)
     # A large face is a large part of the picture.
     large = np.array([200, 100, 900, 700], np.float32)
-    whole_only = changes.next(screen, [large])
+    whole_only = changes.next(screen, [large], None)
     assert whole_only[0] == whole_only[1] == (whole, True)
-    assert changes.next(moved, [large, face])[1] == (near_face, False)  # as that of a photograph on a slide
+    assert changes.next(moved, [large, face], None)[1] == (
+        near_face,
+        False,
+    )  # as that of a photograph on a slide
 
 
 @pytest.mark.parametrize(
@@ -139,10 +178,13 @@ def test_what_may_be_a_cut_holds_every_cut() -> None:
     random = np.random.default_rng(1)
     for scale in (0.2, 1.0, 4.0):
         change = random.gamma(1.0, scale, 400)
-        change[random.choice(400, 12, replace=False)] += 12.0
-        first = np.flatnonzero(np.diff(find_shots(np.arange(400) / 25, change))) + 1
-        assert len(first) > 3
-        assert all(sudden(change[i], change[max(i - 7, 0) : i]) for i in first)
+        change[random.choice(400, 12, replace=False)] += 40.0
+        for ratio, first in (
+            (CUT_RATIO, cuts(np.arange(400) / 25, change)),
+            (FACE_JUMPS, cuts(np.arange(400) / 25, np.ones(400), change)),
+        ):
+            assert len(first) > 3
+            assert all(sudden(change[i], change[max(i - 7, 0) : i], ratio) for i in first)
 
 
 def test_what_moves_in_the_dark_is_no_repeated_picture() -> None:
