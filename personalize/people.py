@@ -33,7 +33,8 @@ SEARCH_S, SELDOM_S = 1.0, 3.0  # between searches for small faces in tiles: whil
 STILL, STILL_SHARE, STILL_LOOKS = 0.001, 0.75, 4
 PORTRAIT = (12, 14)  # px, width and height of the grey picture that people are told apart by
 # Between 20 people (GRID and four more, 3 s each) a threshold of 2 takes 1 % of pairs for the same person and
-# no pair of one person's shots for two.
+# no pair of one person's shots for two. Of shots of a second and a half it takes one in ten of two men's for another's
+# by one of them, and none by all that are taken.
 SHAPE_SCALE, PORTRAIT_SCALE, OTHER_PERSON = 0.05, 0.25, 2.0
 MOST_PEOPLE = 10  # are tried as the main person, those with the largest tracklets
 
@@ -254,24 +255,29 @@ def is_photograph(shapes: Sequence[F32]) -> bool:
 
 
 @dataclass(frozen=True)
-class Look:
-    """How one person looks: median landmarks [478, 3] of norm 1 in one pose, median PORTRAIT of norm 1."""
+class Looks:
+    """How n faces look: median landmarks [n, 478 x 3] in one pose, median portraits less their mean, all of norm 1."""
 
-    shape: F64
-    portrait: F64
+    shapes: F64
+    portraits: F64
 
     @classmethod
-    def of(cls, tracklet: Tracklet, pose: F64) -> Look:
-        """The look of a tracklet that has samples; `pose`: landmarks [478, 3] to turn its landmarks onto."""
-        shape = np.median(align(np.asarray(tracklet.shapes, np.float64), pose), axis=0)
-        portrait = np.median(np.asarray(tracklet.portraits, np.float64), axis=0)
-        portrait -= portrait.mean()
-        return cls(shape / np.linalg.norm(shape), portrait / max(float(np.linalg.norm(portrait)), 1e-9))
+    def of(cls, tracklets: Sequence[Tracklet], pose: F64) -> Looks:
+        """Of tracklets that have samples; `pose`: landmarks [478, 3] to turn theirs onto."""
+        shapes = [np.median(align(np.asarray(t.shapes, np.float64), pose), axis=0).ravel() for t in tracklets]
+        portraits = [np.median(np.asarray(t.portraits, np.float64), axis=0).ravel() for t in tracklets]
+        return cls(
+            *(_of_norm_1(np.stack(rows)) for rows in (shapes, [grey - grey.mean() for grey in portraits]))
+        )
 
-    def distance(self, other: Look) -> float:
-        """Under OTHER_PERSON for one person: difference of the shapes, and lack of correlation of the portraits."""
-        shape = float(np.linalg.norm(self.shape - other.shape))
-        return shape / SHAPE_SCALE + (1 - float((self.portrait * other.portrait).sum())) / PORTRAIT_SCALE
+    def distances(self, one: int) -> F64:
+        """[n] of all from one of them: difference of the shapes, and lack of correlation of the portraits."""
+        shape = np.linalg.norm(self.shapes - self.shapes[one], axis=1)
+        return shape / SHAPE_SCALE + (1 - self.portraits @ self.portraits[one]) / PORTRAIT_SCALE
+
+
+def _of_norm_1(rows: F64) -> F64:
+    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
 
 
 def main_person(tracklets: list[Tracklet]) -> tuple[list[Tracklet], list[Tracklet]]:
@@ -290,21 +296,31 @@ def main_person(tracklets: list[Tracklet]) -> tuple[list[Tracklet], list[Trackle
         # The one found first, in the largest tracklet, unless another is clearly more in the picture.
         if sum(t.weight for t in same) > 1.05 * sum(t.weight for t in best):
             best = same
-        theirs = {id(t) for t in [rest[0], *same]}
+        theirs = {id(t) for t in same}
         rest = [t for t in rest if id(t) not in theirs]
     mine = {id(t) for t in best}
     return best, [t for t in faces if id(t) not in mine]
 
 
 def _same_person(seed: Tracklet, faces: list[Tracklet]) -> list[Tracklet]:
-    """Tracklets that look like `seed`. Nobody is in two places at once: of faces seen together, the most alike."""
-    pose = np.asarray(seed.shapes[0], np.float64)
-    look = Look.of(seed, pose)
-    distances = [look.distance(Look.of(t, pose)) for t in faces]
-    same: list[Tracklet] = []
-    taken: set[int] = set()
-    for i in np.argsort(distances, kind="stable"):
-        if distances[i] < OTHER_PERSON and taken.isdisjoint(faces[i].frames):
-            same.append(faces[i])
-            taken.update(faces[i].frames)
-    return same
+    """Tracklets that look like `seed`, and like each other, the most alike first.
+
+    In two seconds a face shows but part of how it looks, so the distance from all that are taken counts, on average.
+    What looks unlike all that was found by it is alone. Nobody is in two places at once: of faces seen together, the
+    most alike.
+    """
+    looks = Looks.of(faces, np.asarray(seed.shapes[0], np.float64))
+    taken: list[int] = []
+    frames = set[int]()
+    waiting, far = set(range(len(faces))), np.zeros(len(faces))
+    first = nearest = faces.index(seed)
+    while True:
+        waiting.remove(nearest)
+        if frames.isdisjoint(faces[nearest].frames):
+            taken.append(nearest)
+            frames.update(faces[nearest].frames)
+            far += looks.distances(nearest)
+        nearest = min(waiting, key=lambda i: float(far[i]), default=-1)
+        if nearest < 0 or far[nearest] > OTHER_PERSON * len(taken):
+            alone = far[first] > OTHER_PERSON * (len(taken) - 1)
+            return [seed] if alone else [faces[i] for i in taken]

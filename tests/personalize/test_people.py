@@ -14,7 +14,7 @@ import pytest
 from personalize.people import (
     OTHER_PERSON,
     FaceFollower,
-    Look,
+    Looks,
     Tracklet,
     apart,
     main_person,
@@ -232,19 +232,41 @@ def test_people_are_told_apart_by_the_shape_of_the_face_and_by_how_the_head_look
     one, other = tracklet(1, range(0, 30)), tracklet(2, range(40, 70))
     pose = np.asarray(one.shapes[0], np.float64)
 
-    def mixed(shape: Tracklet, portrait: Tracklet, light: float = 1.0) -> Look:
+    def mixed(shape: Tracklet, portrait: Tracklet, light: float = 1.0) -> Tracklet:
         made = tracklet(1, range(80, 110))
         turn = np.array([[0.0, -1.3, 0.0], [1.3, 0.0, 0.0], [0.0, 0.0, 1.3]])
         samples = [(s @ turn, light * p) for s, p in zip(shape.shapes, portrait.portraits)]
         made.sightings = [replace(made.sightings[0], sample=sample) for sample in samples]
-        return Look.of(made, pose)
+        return made
 
-    look = Look.of(one, pose)
-    assert look.distance(mixed(one, one, 0.5)) < 0.2
-    assert look.distance(mixed(other, one)) > OTHER_PERSON / 2
-    assert look.distance(mixed(one, other)) > OTHER_PERSON / 2
-    apart = look.distance(mixed(other, one)) + look.distance(mixed(one, other))
-    assert look.distance(mixed(other, other)) == pytest.approx(apart, abs=0.1)
+    faces = one, mixed(one, one, 0.5), mixed(other, one), mixed(one, other), mixed(other, other)
+    _, same, shape, portrait, both = Looks.of(faces, pose).distances(0)
+    assert same < 0.2 and min(shape, portrait) > OTHER_PERSON / 2
+    assert both == pytest.approx(shape + portrait, abs=0.1)
+
+
+def test_a_shot_is_of_the_person_whose_other_shots_it_looks_like() -> None:
+    """Not of whom the longest shot alone looks like: a laugh, or a face turned aside."""
+    laugh, longest = np.random.default_rng(3).normal(size=(2, 478, 3))
+
+    def shot(first: int, frames: int, laughs: float, like_longest: float = 0.0) -> Tracklet:
+        made = tracklet(1, range(first, first + frames), seed=first)
+        made.sightings = [
+            replace(
+                seen,
+                sample=seen.sample
+                and (seen.sample[0] + (10 * (laughs * laugh + like_longest * longest)), seen.sample[1]),
+            )
+            for seen in made.sightings
+        ]
+        return made
+
+    mine = [shot(0, 90, 0.0, 0.4), *(shot(100 * k, 30, 0.3 * k) for k in range(1, 5))]
+    other = shot(600, 30, 0.0, 1.3)
+    looks = Looks.of([*mine, other], np.asarray(mine[0].shapes[0], np.float64)).distances(0)
+    assert looks[4] > OTHER_PERSON > looks[5] and looks.argmax() == 4
+    kept, left = main_person([other, *mine])
+    assert {id(t) for t in kept} == {id(t) for t in mine} and left == [other]
 
 
 def test_of_two_faces_alike_that_are_seen_together_one_is_the_person() -> None:
