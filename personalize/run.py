@@ -222,8 +222,9 @@ def read_refined(folder: Path) -> Refined:
 
 def write_camera(folder: Path, camera: Camera, bundle: Bundle) -> None:
     """`camera/camera.json` and `camera/bundle.npz`."""
-    write_json(folder / "camera.json", dataclasses.asdict(camera))
-    write_npz(folder / "bundle.npz", **vars(bundle))
+    told = dataclasses.asdict(camera)
+    write_npz(folder / "bundle.npz", zoom=told.pop("zoom"), **vars(bundle))
+    write_json(folder / "camera.json", told)
 
 
 def read_camera(folder: Path) -> tuple[Camera, Bundle]:
@@ -232,7 +233,7 @@ def read_camera(folder: Path) -> tuple[Camera, Bundle]:
     for name in ("principal_px", "distortion", "size"):
         data[name] = tuple(data[name])
     arrays: dict[str, Any] = read_npz(folder / "bundle.npz")
-    return Camera(**data), Bundle(**arrays)
+    return Camera(**data, zoom=arrays.pop("zoom")), Bundle(**arrays)
 
 
 def write_track(path: Path, track: Track) -> None:

@@ -91,8 +91,11 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 13, ("focal_px", "distortion")
-    needs = ("ingest/media.json", "landmarks/landmarks.npz", "landmarks/features.npz")
+    name, version, reads = "camera", 14, ("focal_px", "distortion")
+    needs = (
+        *("ingest/media.json", "ingest/frames.npz", "landmarks/landmarks.npz"),
+        "landmarks/features.npz",
+    )
     makes = ("camera.json", "bundle.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -104,6 +107,7 @@ class CameraStage(Stage):
             files.read_landmarks(root / "landmarks/landmarks.npz"),
             files.read_features(root / "landmarks/features.npz"),
             run_head(context.settings),
+            files.read_frames(root / "ingest/frames.npz").segment,
             focal_given=context.settings.focal_px,
             distortion=context.settings.distortion,
             recorded_mm=context.run.read_json("ingest/media.json")["focal_mm"],

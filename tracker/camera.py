@@ -23,6 +23,7 @@ from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, of_rigid_f
 from tracker.rigid_surface import SurfacePoints, surface_points
 from tracker.similarity import similarity
 from tracker.track import F64, Bundle, Camera, Landmarks, TrackError
+from tracker.zoom import zoom_of_shots
 
 PRIOR_FOCAL = 1.3  # of the picture's long side: phones and webcams .7-1.2, camcorders and portraits 1.2-2.5
 PRIOR_SD_LOG = 0.35
@@ -48,6 +49,7 @@ def estimate_camera(
     landmarks: Landmarks,
     features: FeatureTracks,
     head: HeadModel,
+    segment: NDArray[np.int32],
     focal_given: float | None = None,
     distortion: tuple[float, ...] = (),
     recorded_mm: float = 0.0,
@@ -55,7 +57,8 @@ def estimate_camera(
 ) -> tuple[Camera, Bundle]:
     """The camera of one clip and the rigid evidence for it, in the frame of the mean head.
 
-    features: what was followed through the frames of the landmarks. focal_given: px, then nothing is estimated but
+    features: what was followed through the frames of the landmarks. segment: [T], number of the uninterrupted shot.
+    focal_given: px, then nothing is estimated but
     poses and points. distortion: its radial coefficients, see `Lens`. recorded_mm: what the camera wrote of its focal
     length, on film 36 mm wide; 0 if nothing.
     Raises TrackError for a distortion without the focal length that it was measured with.
@@ -63,6 +66,8 @@ def estimate_camera(
     if distortion and not focal_given:
         raise TrackError("a lens's distortion goes with its focal length: give both")
     prior = _camera(landmarks.size, focal_given, distortion, recorded_mm)
+    prior = replace(prior, zoom=zoom_of_shots(landmarks, segment, head))
+    landmarks = landmarks.through(prior.lens)
     tracks = _not_aside(_straight(features, prior), landmarks)
     some = tracks.select(_telling(landmarks.points[tracks.frames]), MOST_POINTS)
     start, surface, kept = _start(some, landmarks, head, prior)
@@ -97,8 +102,8 @@ def _told(prior: Camera, scene: RigidScene, focal: float, sd_log: float) -> Came
 
 
 def _straight(tracks: FeatureTracks, camera: Camera) -> FeatureTracks:
-    """What was followed as a camera without distortion would see it."""
-    seen = camera.lens.points(tracks.observations[:, 2:])
+    """What was followed as a camera without distortion and zoom would see it."""
+    seen = camera.lens.points(tracks.observations[:, 2:], tracks.observations[:, 0].astype(int))
     return replace(tracks, observations=np.concatenate([tracks.observations[:, :2], seen], axis=1))
 
 
@@ -159,7 +164,7 @@ def _start(
     rigid = of_rigid_face(embedding.landmarks)
     mean = np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis))
     surface = head.landmark_positions(*mean)[rigid].astype(np.float64)
-    xy = camera.lens.points(landmarks.points[tracks.frames][:, embedding.landmarks[rigid], :2])
+    xy = landmarks.points[tracks.frames][:, embedding.landmarks[rigid], :2].astype(np.float64)
     eyes = landmarks.points[tracks.frames][:, [RIGHT_EYE_OUTER, LEFT_EYE_OUTER], :2]
     errors = OUTLIER * np.linalg.norm(eyes[:, 0] - eyes[:, 1], axis=1)
     model = camera_model(camera.focal_px, camera.principal_px, camera.size)

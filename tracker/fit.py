@@ -64,8 +64,9 @@ def fit_track(
     weights = Weights()
     model = landmark_model(head, weights)
     good = _measurable(landmarks, model, usable)
-    observed = camera.lens.points(landmarks.points[good][..., :2])
-    energy, start = _start(model, weights, camera, observed, landmarks.points[good, :, 2])
+    straight = landmarks.through(camera.lens).points[good].astype(np.float64)
+    observed = straight[..., :2]
+    energy, start = _start(model, weights, camera, straight)
     share, sound = _share(evidence, good), trusted(evidence, good)
     keys = key_frames(observed[sound], energy.px_per_m[sound]).of(sound)
     energy = with_lips_shut(energy, start, keys.rest)
@@ -98,11 +99,9 @@ def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.b
     return good
 
 
-def _start(
-    model: LandmarkModel, weights: Weights, camera: Camera, observed: F64, depth: NDArray[np.floating]
-) -> tuple[Energy, F64]:
-    """The clip's energy, and poses of the mean head by Procrustes against the landmarker's own depth [n, 478] px."""
-    seen = np.concatenate([observed, depth[..., None]], axis=2)[:, model.landmarks]
+def _start(model: LandmarkModel, weights: Weights, camera: Camera, straight: F64) -> tuple[Energy, F64]:
+    """The clip's energy, and poses of the mean head by Procrustes against landmarks [n, 478, 3] with their depth."""
+    seen = straight[:, model.landmarks]
     px_per_m, matrix, _ = similarity(model.mean, seen)
     centre = seen.mean(1)
     principal = np.array(camera.principal_px, np.float64)
@@ -110,7 +109,7 @@ def _start(
     translation = ray / px_per_m[:, None]
     rotation = rotation_vector(matrix)
     x = np.concatenate([np.zeros((len(seen), model.expressions)), rotation, translation], axis=1)
-    return _energy(model, weights, camera, observed, px_per_m, x), x
+    return _energy(model, weights, camera, straight[..., :2], px_per_m, x), x
 
 
 def _energy(
@@ -194,13 +193,13 @@ def resume(
 ) -> tuple[Energy, F64, F64, Frames]:
     """Where a track stands, the inverse of `make_track`, for its n valid frames. evidence: see `fit_track`.
 
-    Returns energy, unknowns x [n, P], all landmarks [n, 478, 2] px without distortion, and the frames [n].
+    Returns energy, unknowns x [n, P], all landmarks [n, 478, 2] px without distortion and zoom, and the frames [n].
     """
     weights = Weights()
     model = landmark_model(head, weights)
     finite = np.isfinite(landmarks.points[:, model.landmarks]).all(axis=(1, 2))
     good = np.flatnonzero(track.valid & finite)
-    observed = camera.lens.points(landmarks.points[good][..., :2])
+    observed = camera.lens.points(landmarks.points[good][..., :2], good)
     turn = torch.from_numpy(track.rotation[good].astype(np.float64))
     matrix = axis_angle_to_rotation_matrix(turn).numpy()
     rotation, translation = rotation_vector(matrix), track.translation[good] + matrix @ model.centre
@@ -259,6 +258,7 @@ def make_track(
         head=f"{head.name}@{head.sha256}",
         lip_gap_mm=lip_gaps(head, identity, expression, jaw)[nearest],
         reprojection_px=error.mean(1).astype(np.float32)[nearest],
+        zoom=camera.zoom,
     )
 
 

@@ -1,30 +1,43 @@
-"""The lens of a camera that does not draw straight lines straight, by OpenCV's radial model."""
+"""What stands between a pinhole and a picture: a lens that draws straight lines bent, and shots that are enlarged."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 CONVERGED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)  # px
 
 
+def never() -> F32:
+    """The zoom of a clip in which no picture is enlarged."""
+    return np.zeros((0, 3), np.float32)
+
+
 @dataclass(frozen=True)
 class Lens:
-    """distortion: up to three radial coefficients (k1, k2, k3), none for a pinhole. They go with the focal length and
-    the principal point (px, pixel centres at integers) that they were calibrated with.
+    """distortion: up to three radial coefficients (k1, k2, k3) of OpenCV's model, none for a pinhole. They go with the
+    focal length and the principal point (px, pixel centres at integers) that they were calibrated with.
+
+    zoom: [T, 3] times that each frame's picture is enlarged, about (x, y) px; [0, 3] where none is.
     """
 
     focal_px: float
     principal_px: tuple[float, float]
     distortion: tuple[float, ...]
+    zoom: F32 = field(default_factory=never)
 
-    def points(self, xy: NDArray[np.floating]) -> F64:
-        """Points [..., 2] px as a camera without distortion would see them."""
+    def points(self, xy: NDArray[np.floating], frames: NDArray[np.integer]) -> F64:
+        """Points [n, ..., 2] px of the frames [n] as a camera without distortion and zoom would see them."""
         flat = xy.astype(np.float64)
+        if len(self.zoom):
+            about = self.zoom[frames, 1:].astype(np.float64).reshape(-1, *[1] * (flat.ndim - 2), 2)
+            times = self.times(frames).reshape(-1, *[1] * (flat.ndim - 1))
+            flat = about + (flat - about) / times
         if not self.distortion or not flat.size:
             return flat
         matrix, coefficients = self._opencv()
@@ -32,9 +45,25 @@ class Lens:
         straight = cv2.undistortPoints(seen, matrix, coefficients, P=matrix, criteria=CONVERGED)
         return straight.reshape(flat.shape)
 
-    def picture(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A picture as a camera without distortion would see it."""
+    def picture(self, rgb: NDArray[np.uint8], frame: int) -> NDArray[np.uint8]:
+        """A frame's picture as a camera without distortion and zoom would see it."""
+        if len(self.zoom) and self.zoom[frame, 0] != 1:
+            times, x, y = self.zoom[frame].tolist()
+            if times > 1:  # what is too fine for the smaller picture
+                rgb = np.asarray(cv2.GaussianBlur(rgb, (0, 0), 0.5 * (times**2 - 1) ** 0.5), np.uint8)
+            to_picture = np.array([[times, 0, x - times * x], [0, times, y - times * y]])
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            rgb = np.asarray(
+                cv2.warpAffine(
+                    rgb, to_picture, rgb.shape[1::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE
+                ),
+                np.uint8,
+            )
         return cv2.undistort(rgb, *self._opencv()) if self.distortion else rgb
+
+    def times(self, frames: NDArray[np.integer]) -> F64:
+        """[n] times that the pictures of the frames [n] are enlarged."""
+        return self.zoom[frames, 0].astype(np.float64) if len(self.zoom) else np.ones(len(frames))
 
     def _opencv(self) -> tuple[F64, F64]:
         """Camera matrix [3, 3] and distortion [5]."""

@@ -245,11 +245,11 @@ def _looked_at(
 
 
 def _pictures(camera: Camera, frames: Iterable[Frame], good: Index) -> Iterator[tuple[int, U8]]:
-    """Row and picture of each of the frames `good` [n], in order, the lens's distortion taken out."""
+    """Row and picture of each of the frames `good` [n], in order, distortion and zoom taken out."""
     row_of = {frame: row for row, frame in enumerate(good.tolist())}
     for frame, (_, rgb) in enumerate(frames):
         if frame in row_of:
-            yield row_of[frame], camera.lens.picture(rgb)
+            yield row_of[frame], camera.lens.picture(rgb, frame)
 
 
 def _overlap(time: F64) -> int:

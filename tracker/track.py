@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.lens import Lens
+from tracker.lens import Lens, never
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -39,6 +39,13 @@ class Landmarks:
     blendshape_names: tuple[str, ...]
     size: tuple[int, int]
 
+    def through(self, lens: Lens) -> Landmarks:
+        """As a camera without distortion and zoom would see them."""
+        frames = np.arange(len(self.points))
+        depth = self.points[..., 2:] / lens.times(frames)[:, None, None]
+        points = np.concatenate([lens.points(self.points[..., :2], frames), depth], axis=-1)
+        return replace(self, points=points.astype(np.float32))
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -48,6 +55,7 @@ class Camera:
     method: `bundle` when the clip's own motion decided, or had its say beside a lens that the camera wrote down;
     `prior` when the stated prior did; `given` by the user.
     prior: the sentence that states the prior used.
+    zoom: [T, 3] of each frame, see `Lens`.
     """
 
     focal_px: float
@@ -57,11 +65,12 @@ class Camera:
     size: tuple[int, int]
     method: str
     prior: str
+    zoom: F32 = field(default_factory=never)
 
     @property
     def lens(self) -> Lens:
-        """What takes the distortion out of its pictures."""
-        return Lens(self.focal_px, self.principal_px, self.distortion)
+        """What takes distortion and zoom out of its pictures."""
+        return Lens(self.focal_px, self.principal_px, self.distortion, self.zoom)
 
 
 @dataclass(frozen=True)
@@ -69,8 +78,8 @@ class Bundle:
     """Rigid evidence of the feature tracks on the upper face.
 
     frame: [M] i4, frames that have a pose. rotation: [M, 3] axis-angle, rad, and translation: [M, 3] m take
-    `points` to the camera frame (OpenCV axes). points: [Q, 3] m. observations: [O, 4] (frame, point, x px, y px), the
-    lens's distortion taken out.
+    `points` to the camera frame (OpenCV axes). points: [Q, 3] m. observations: [O, 4] (frame, point, x px, y px),
+    distortion and zoom taken out.
     """
 
     frame: NDArray[np.int32]
@@ -87,7 +96,8 @@ class Track:
     X_camera = R(rotation) X_head + translation, camera frame OpenCV (x right, y down, z forward).
     time: [T] s. valid: [T] bool. confidence: [T] 0..1. identity: [Ki]. expression: [T, Ke]. jaw, neck: [T, 3]
     axis-angle rad. eyes: [T, 2, 3] axis-angle rad, left then right. rotation: [T, 3] axis-angle rad. translation: [T,
-    3] m. focal px. principal: [2] px. distortion: [0..3] radial coefficients, see `Camera`. size: (width, height).
+    3] m. focal px. principal: [2] px. distortion: [0..3] radial coefficients, and zoom: [T, 3] or [0, 3], see
+    `Lens`; both go between the pinhole and the picture. size: (width, height).
     head: `name@sha256` of the head model. lip_gap_mm: [T]. reprojection_px: [T], mean over landmarks, from where they
     lie without distortion; refined, inner lips' as the colours have them. Rows of invalid frames are finite and tell
     nothing: the nearest good pose, or another tracker's own.
@@ -110,9 +120,10 @@ class Track:
     head: str
     lip_gap_mm: F32
     reprojection_px: F32
+    zoom: F32 = field(default_factory=never)
 
     @property
     def lens(self) -> Lens:
-        """What takes the distortion out of its camera's pictures."""
+        """What takes distortion and zoom out of its camera's pictures."""
         x, y = self.principal.tolist()
-        return Lens(self.focal, (x, y), tuple(self.distortion.tolist()))
+        return Lens(self.focal, (x, y), tuple(self.distortion.tolist()), self.zoom)

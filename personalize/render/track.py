@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -35,7 +35,7 @@ U8 = NDArray[np.uint8]
 class TrackPictures:
     """Draws any frame of a run: its track, in which modes, on which part of the picture.
 
-    landmarks: without the camera's distortion, which is taken out of the pictures too.
+    landmarks: without the camera's distortion and zoom, which are taken out of the pictures too.
     reasons: [T] why each frame is left out, `ok` where it is not.
     """
 
@@ -51,9 +51,7 @@ class TrackPictures:
     def of(cls, run: RunFolder, head: HeadModel, modes: Sequence[str]) -> TrackPictures:
         """Read the run's track; learn the subject's albedo where one of the modes needs it."""
         track = read_track(run.path / "refine/track.npz")
-        landmarks = read_landmarks(run.path / "landmarks/landmarks.npz")
-        seen = track.lens.points(landmarks.points[..., :2]).astype(np.float32)
-        landmarks = replace(landmarks, points=np.concatenate([seen, landmarks.points[..., 2:]], axis=-1))
+        landmarks = read_landmarks(run.path / "landmarks/landmarks.npz").through(track.lens)
         reasons = read_reasons(run.path / "refine/quality.csv").tolist()
         valid = np.flatnonzero(track.valid)
         crop = around_face(landmarks.points[valid, :, :2], landmarks.size)
@@ -61,7 +59,7 @@ class TrackPictures:
         if any(mode in NEEDS_ALBEDO for mode in modes):
             keys = set(valid[np.linspace(0, len(valid) - 1, KEYS).round().astype(int)].tolist())
             albedo = learn_albedo(
-                scene(track.lens.picture(rgb), crop, track, frame, landmarks, head)
+                scene(track.lens.picture(rgb, frame), crop, track, frame, landmarks, head)
                 for frame, (_, rgb) in enumerate(FrameReader(run.video))
                 if frame in keys
             )
@@ -81,7 +79,7 @@ class TrackPictures:
 
     def film(self, rgb: U8, frame: int) -> U8:
         """The film's picture: the video and each mode, below them time and confidence."""
-        rgb = self.track.lens.picture(rgb)
+        rgb = self.track.lens.picture(rgb, frame)
         panels = [self.crop.picture(rgb), *self._drawn(rgb, frame, self.crop, self.modes)]
         for panel, name in zip(panels, ("video", *self.modes)):
             letter(panel, name, (LETTERS, 2 * LETTERS), LETTERS)
@@ -104,7 +102,8 @@ class TrackPictures:
         side = round(float((high - low).max()) * (1 + 2 * TILE_MARGIN))
         x, y = np.round((low + high - side) / 2).astype(int).tolist()
         close = Crop((x, y), (side, side), (TILE, TILE))
-        return scene(self.track.lens.picture(rgb), close, self.track, frame, self.landmarks, self.head)
+        rgb = self.track.lens.picture(rgb, frame)
+        return scene(rgb, close, self.track, frame, self.landmarks, self.head)
 
     def _drawn(self, rgb: U8, frame: int, crop: Crop, modes: Sequence[str]) -> list[U8]:
         if not self.track.valid[frame]:

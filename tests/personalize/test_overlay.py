@@ -155,5 +155,5 @@ def test_the_lens_is_taken_out_of_what_is_shown(run: RunFolder) -> None:
     rgb = np.random.default_rng(0).integers(0, 255, (*pictures.landmarks.size[::-1], 3)).astype(np.uint8)
     width, height = pictures.crop.size
     shown = dataclasses.replace(pictures, track=bent).film(rgb, LEFT_OUT)[60:height, :width]
-    expected = pictures.crop.picture(bent.lens.picture(rgb))[60:height]
+    expected = pictures.crop.picture(bent.lens.picture(rgb, 0))[60:height]
     assert (shown == expected).mean() > 0.99 and (shown == pictures.crop.picture(rgb)[60:height]).mean() < 0.5

@@ -16,10 +16,11 @@ import pytest
 
 from personalize.errors import UserError
 from personalize.reporter import Reporter
-from personalize.run import RunFolder, read_camera, write_features, write_landmarks
+from personalize.run import RunFolder, read_camera, write_features, write_frames, write_landmarks
 from personalize.settings import Settings
 from personalize.stage import Context, Stage, is_cached, run_stages
 from personalize.stages import CameraStage, Ingest
+from tests.personalize.people_factory import frames_of
 from tracker.feature_tracks import FeatureTracks
 from tracker.track import Landmarks
 
@@ -271,6 +272,7 @@ def test_the_camera_believes_what_the_file_tells_of_the_lens(context: Context) -
     root = context.run.path
     (root / "ingest").mkdir()
     (root / "ingest/media.json").write_text(json.dumps({"focal_mm": 27.0}))
+    write_frames(root / "ingest/frames.npz", frames_of(np.arange(3) / 25, np.ones(3, bool)))
     (root / "landmarks").mkdir()
     points = np.full((3, 478, 3), np.nan, np.float32)
     landmarks = Landmarks(

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
+from tests.tracker.one_shot import estimate_camera
 from tracker.bundle_adjustment import RigidScene, _Problem, _State, absolute_pose, adjust, camera_model
-from tracker.camera import PRIOR_FOCAL, PRIOR_SD_LOG, estimate_camera
+from tracker.camera import PRIOR_FOCAL, PRIOR_SD_LOG
 from tracker.feature_tracks import FeatureFollower, FeatureTracks
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, LIPS, POINTS

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tracker.lens import Lens
+from tracker.track import Landmarks
 
 FOCAL, PRINCIPAL = 500.0, (319.5, 239.5)
 MATRIX = np.array([[FOCAL, 0, PRINCIPAL[0]], [0, FOCAL, PRINCIPAL[1]], [0, 0, 1]])
@@ -25,29 +26,50 @@ def test_points_come_back_to_where_a_pinhole_shows_them(distortion: tuple[float,
     straight = np.random.default_rng(0).uniform((60, 60), (580, 420), (40, 2))
     bent = seen(straight, distortion)
     assert np.abs(bent - straight).max() > 2
-    back = Lens(FOCAL, PRINCIPAL, distortion).points(bent.reshape(8, 5, 2))
+    back = Lens(FOCAL, PRINCIPAL, distortion).points(bent.reshape(8, 5, 2), np.arange(8))
     np.testing.assert_allclose(back, straight.reshape(8, 5, 2), atol=0.02)
 
 
 def test_points_at_the_rim_of_a_wide_lens_come_back_as_well() -> None:
     straight = np.array([[-250.0, 60.0], [900.0, 440.0]])
     bent = seen(straight, (-0.25, 0.07))
-    np.testing.assert_allclose(Lens(FOCAL, PRINCIPAL, (-0.25, 0.07)).points(bent), straight, atol=0.01)
+    np.testing.assert_allclose(
+        Lens(FOCAL, PRINCIPAL, (-0.25, 0.07)).points(bent, np.arange(2)), straight, atol=0.01
+    )
 
 
-def test_a_picture_moves_as_its_points_do() -> None:
-    lens = Lens(FOCAL, PRINCIPAL, (-0.25,))
+@pytest.mark.parametrize("times", [0.85, 1.0, 1.5])
+@pytest.mark.parametrize("distortion", [(), (-0.25,)])
+def test_a_picture_moves_as_its_points_do(distortion: tuple[float, ...], times: float) -> None:
+    zoom = np.array([[1.0, 0, 0], [times, 280, 220]], np.float32)
+    lens = Lens(FOCAL, PRINCIPAL, distortion, zoom)
     for dot in [(120.0, 100.0), (500.0, 400.0)]:
         picture = np.zeros((480, 640, 3), np.uint8)
         cv2.circle(picture, (int(dot[0]), int(dot[1])), 6, (255, 255, 255), -1)
-        mass = lens.picture(picture)[..., 0].astype(np.float64)
-        rows, columns = np.mgrid[:480, :640]
-        centre = np.array([(columns * mass).sum(), (rows * mass).sum()]) / mass.sum()
-        np.testing.assert_allclose(centre, lens.points(np.array(dot)), atol=0.4)
+        for frame in range(2):
+            mass = lens.picture(picture, frame)[..., 0].astype(np.float64)
+            rows, columns = np.mgrid[:480, :640]
+            centre = np.array([(columns * mass).sum(), (rows * mass).sum()]) / mass.sum()
+            (straight,) = lens.points(np.array([dot]), np.array([frame]))
+            np.testing.assert_allclose(centre, straight, atol=0.4)
+
+
+def test_an_enlarged_picture_comes_back_to_its_size_about_its_place() -> None:
+    """Landmarks' depth too; other frames stay as they are."""
+    zoom = np.array([[1, 0, 0], [1.5, 100, 200]], np.float32)
+    points = np.random.default_rng(0).uniform(50, 400, (2, 478, 3)).astype(np.float32)
+    clip = Landmarks(np.arange(2) / 25, points, np.ones(2), np.zeros((2, 52)), (), (640, 480))
+    straight = clip.through(Lens(FOCAL, PRINCIPAL, (), zoom)).points
+    np.testing.assert_array_equal(straight[0], points[0])
+    back = 1.5 * (straight[1] - (100, 200, 0)) + (100, 200, 0)
+    np.testing.assert_allclose(back, points[1], atol=1e-3)
+    assert Lens(FOCAL, PRINCIPAL, (), zoom).times(np.array([1, 0])).tolist() == [1.5, 1.0]
 
 
 def test_a_pinhole_changes_nothing() -> None:
     lens = Lens(FOCAL, PRINCIPAL, ())
     picture, points = np.full((4, 5, 3), 7, np.uint8), np.array([[1.25, np.nan]], np.float32)
-    assert lens.picture(picture) is picture
-    np.testing.assert_array_equal(lens.points(points), points)
+    assert lens.picture(picture, 0) is picture
+    np.testing.assert_array_equal(lens.points(points, np.zeros(1, int)), points)
+    enlarged = Lens(FOCAL, PRINCIPAL, (), np.array([[1, 0, 0], [2, 1, 1]], np.float32))
+    assert enlarged.picture(picture, 0) is picture and enlarged.picture(picture, 1) is not picture

@@ -1,0 +1,18 @@
+"""The camera of a clip without cuts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tracker import camera
+from tracker.feature_tracks import FeatureTracks
+from tracker.head import HeadModel
+from tracker.track import Bundle, Camera, Landmarks
+
+
+def estimate_camera(
+    landmarks: Landmarks, features: FeatureTracks, head: HeadModel, **given: Any
+) -> tuple[Camera, Bundle]:
+    return camera.estimate_camera(landmarks, features, head, np.zeros(len(landmarks.time), np.int32), **given)
