@@ -1,8 +1,8 @@
 """How a clip is tracked when its film is spoiled, and whether that is told: `python -m benchmarks spoiled VIDEO ...`.
 
 The first seconds of a video are written anew as they are, and spoiled: compressed, in other light, with noise, out of
-focus, without colours, shaken, with things pasted over the mouth, and small in a wide picture. Each goes through the
-command up to `judge`.
+focus, without colours, shaken, with things pasted over the mouth, captions written over the chin, cut and enlarged by
+turns, and small in a wide picture. Each goes through the command up to `judge`.
 
 used            frames that are used by default, %
 bare out        of those that nothing covers or shakes, which are left out; %
@@ -45,6 +45,14 @@ FOREHEAD = 151
 DARK = (28, 25, 25)
 WARNED = 36  # characters
 WIDE = (1920, 1080)  # px
+WORDS = ("EVERY", "two", "TENTHS", "of a second", "ANOTHER", "word", "COMES")
+WORD_S, UNDER, LETTER = (
+    0.4,
+    0.55,
+    0.3,
+)  # how long it stays; under the mouth, and as high, of the distance of the eyes
+WHITE = (255, 255, 255)
+TURN_S, LARGER = 3.0, 1.3  # every other shot of so many s so many times larger
 INSET = 2.6  # times the distance between the eyes: half of what is seen around a small face
 BELOW = 1.3  # of the distance between the eyes: how far under the mouth a cover comes from
 
@@ -146,6 +154,49 @@ class Small:
         return np.column_stack([scale * np.eye(2), INSET * self._eyes - scale * eyes.mean(0)])
 
 
+class Captioned:
+    """Words one after another where the chin was in the first picture with a face."""
+
+    def __init__(self, fps: float) -> None:
+        self._held, self._shown = round(WORD_S * fps), 0
+        self._first: tuple[F64, float] | None = None
+
+    def __call__(self, rgb: U8, points: F32) -> U8:
+        """The picture with its word."""
+        word = WORDS[self._shown // self._held % len(WORDS)]
+        self._shown += 1
+        if self._first is None and np.isfinite(points).all():
+            eyes = float(np.linalg.norm(points[LEFT_EYE_OUTER] - points[RIGHT_EYE_OUTER]))
+            self._first = points[list(LIPS)].mean(0) + np.array([0, UNDER * eyes]), LETTER * eyes
+        if self._first is None:
+            return rgb
+        middle, height = self._first
+        out, font, bold = rgb.copy(), cv2.FONT_HERSHEY_DUPLEX, max(1, round(height / 10))
+        size = cv2.getFontScaleFromHeight(font, max(2, round(height)), bold)
+        (wide, high), _ = cv2.getTextSize(word, font, size, bold)
+        left, base = (middle + np.array([-wide, high]) / 2).round().astype(int).tolist()
+        for colour, thick in ((DARK, 3 * bold), (WHITE, bold)):
+            cv2.putText(out, word, (left, base), font, size, colour, thick, cv2.LINE_AA)
+        return out
+
+
+class Enlarged:
+    """Every other few seconds larger, about the picture's middle."""
+
+    def __init__(self, fps: float) -> None:
+        self._turn, self._shown = round(TURN_S * fps), 0
+
+    def __call__(self, rgb: U8, _: F32) -> U8:
+        """The picture, or the middle of it."""
+        larger = self._shown // self._turn % 2
+        self._shown += 1
+        if not larger:
+            return rgb
+        middle = (np.array(rgb.shape[1::-1]) - 1) / 2
+        warp = np.column_stack([LARGER * np.eye(2), (1 - LARGER) * middle])
+        return np.asarray(cv2.warpAffine(rgb, warp, rgb.shape[1::-1], flags=cv2.INTER_CUBIC), np.uint8)
+
+
 def _around(rgb: U8, place: F32, wide: float, high: float) -> U8:
     """A rectangle of the picture, at least a pixel large."""
     reach = np.array([wide, high])
@@ -192,7 +243,7 @@ def grey(rgb: U8, _: F32) -> U8:
 WHOLE = "as it is"
 
 
-def ways() -> dict[str, tuple[Picture | Spell, int]]:
+def ways(fps: float) -> dict[str, tuple[Picture | Spell, int]]:
     """Name -> what is done to each picture, x264's crf. For one video: some remember its first picture."""
     return {
         WHOLE: (as_it_is, 12),
@@ -208,6 +259,8 @@ def ways() -> dict[str, tuple[Picture | Spell, int]]:
         "shaken, four times": (Shaken((1.5, 4.5, 7.5, 10.0), 0.1, 0.3), 18),
         "a ball, for 5.5 s": (Cover((1.0,), 0.5, 5.5, skin=False, wide=0.56, aside=-0.1), 18),
         "a ball, from 1 s on": (Cover((1.0,), 0.3, SECONDS, skin=False, wide=0.56, aside=-0.1), 18),
+        "captions": (Captioned(fps), 18),
+        "enlarged by turns": (Enlarged(fps), 18),
         "small": (Small(62, photograph=False), 18),
         "small, by a photograph": (Small(75, photograph=True), 18),
     }
@@ -269,7 +322,7 @@ def main() -> None:
 def spoil(video: Path, folder: Path) -> None:
     """All ways, in a folder for films and runs."""
     points, whole = np.zeros((0, POINTS, 2), np.float32), folder / f"{WHOLE}.run"
-    for name, (way, crf) in ways().items():
+    for name, (way, crf) in ways(probe(video).fps).items():
         film, run = folder / f"{name}.mp4", folder / f"{name}.run"
         write_spoiled(video, film, way, crf, points)
         command = [sys.executable, "-m", "cli.main", "run", str(film), "--out", str(run), "--until", "judge"]

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from benchmarks.spoiled import (
+    LARGER,
+    Captioned,
     Cover,
+    Enlarged,
     Shaken,
     Small,
     blurred,
@@ -78,6 +81,31 @@ def test_a_small_head_lies_in_the_corner(points: np.ndarray, photograph: bool) -
     assert not other[-208:, -208:].any()
 
 
+def test_words_come_one_after_another_under_the_mouth(points: np.ndarray) -> None:
+    rgb, captioned = np.full((200, 240, 3), 100, np.uint8), Captioned(10.0)
+    assert captioned(rgb, np.full_like(points, np.nan)) is rgb
+    shown = [captioned(rgb, points + 20 * k) for k in range(12)]  # a face that moves takes no word along
+    rows, columns = np.argwhere((shown[0] != rgb).any(2)).T
+    assert (rows.min() + rows.max()) / 2 == pytest.approx(120 + 0.55 * EYES_PX, abs=3)
+    assert np.ptp(rows) == pytest.approx(0.3 * EYES_PX, abs=8) and columns.mean() == pytest.approx(120, abs=4)
+    same = [(a == b).all() for a, b in zip(shown, shown[1:])]
+    assert np.flatnonzero(~np.array(same)).tolist() == [
+        2,
+        6,
+        10,
+    ]  # .4 s each, the first began a picture before
+
+
+def test_every_other_shot_is_larger(points: np.ndarray) -> None:
+    rgb = np.zeros((201, 241, 3), np.uint8)
+    rgb[90:111, 150:171] = 255
+    enlarged = Enlarged(2.0)
+    shown = [enlarged(rgb, points) for _ in range(18)]
+    assert [picture is rgb for picture in shown] == [True] * 6 + [False] * 6 + [True] * 6
+    row, column = np.argwhere(shown[6][..., 0] > 127).mean(0)
+    assert (row, column) == pytest.approx((100, 120 + 40 * LARGER), abs=0.5)
+
+
 def test_light_noise_and_focus(points: np.ndarray) -> None:
     flat = np.full((60, 60, 3), 100, np.uint8)
     # Three times the light in gamma 2.2 is 3 ** (1 / 2.2) times the level.
@@ -96,7 +124,7 @@ def test_a_film_is_written_again_at_its_times(tmp_path: Path, points: np.ndarray
     times = [0.0, 0.04, 0.12, 0.2]
     pictures = [np.full((64, 96, 3), 60 + 40 * k, np.uint8) for k in range(4)]
     path = write_video(tmp_path / "v.mp4", pictures, times)
-    way, crf = ways()["as it is"]
+    way, crf = ways(25.0)["as it is"]
     write_spoiled(path, tmp_path / "out.mp4", way, crf, points[None])
     again = list(FrameReader(tmp_path / "out.mp4"))
     assert [time for time, _ in again] == pytest.approx(times, abs=1e-3)
