@@ -23,7 +23,7 @@ from tracker.landmark_indices import LEFT_EYE_OUTER, RIGHT_EYE_OUTER, of_rigid_f
 from tracker.rigid_surface import SurfacePoints, surface_points
 from tracker.similarity import similarity
 from tracker.track import F64, Bundle, Camera, Landmarks, TrackError
-from tracker.zoom import zoom_of_shots
+from tracker.zoom import zoom_of_frames
 
 PRIOR_FOCAL = 1.3  # of the picture's long side: phones and webcams .7-1.2, camcorders and portraits 1.2-2.5
 PRIOR_SD_LOG = 0.35
@@ -66,7 +66,7 @@ def estimate_camera(
     if distortion and not focal_given:
         raise TrackError("a lens's distortion goes with its focal length: give both")
     prior = _camera(landmarks.size, focal_given, distortion, recorded_mm)
-    prior = replace(prior, zoom=zoom_of_shots(landmarks, segment, head))
+    prior = replace(prior, zoom=zoom_of_frames(landmarks, segment, head))
     landmarks = landmarks.through(prior.lens)
     tracks = _not_aside(_straight(features, prior), landmarks)
     some = tracks.select(_telling(landmarks.points[tracks.frames]), MOST_POINTS)

@@ -7,13 +7,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.tracker.test_fit import CAMERA, HEAD, SIZE, Talker
 from tests.tracker.test_refine import CAMERA as FILM_CAMERA
 from tests.tracker.test_refine import NO_BUNDLE, Film, filmed, freckled
 from tracker.refine import refine_track
 from tracker.track import F32, Landmarks
-from tracker.zoom import ENLARGED, zoom_of_shots
+from tracker.zoom import ENLARGED, zoom_of_frames
 
 SHOTS = np.repeat([0, 1, 2, 3], [50, 20, 40, 30])
 MIDDLE = (np.array(SIZE) - 1) / 2
@@ -36,15 +37,39 @@ def test_shots_that_are_enlarged_are_told_from_people_who_lean_forward(talker: T
     times = np.array([1.0, 1.3, 1.1, 0.8])[SHOTS]
     points = enlarged(talker.landmarks, times).points
     points[::7] = np.nan  # no face
-    zoom = zoom_of_shots(replace(talker.landmarks, points=points), SHOTS, HEAD)
+    zoom = zoom_of_frames(replace(talker.landmarks, points=points), SHOTS, HEAD)
     np.testing.assert_allclose(zoom[SHOTS == 1, 0], 1.3, rtol=0.04)
     np.testing.assert_allclose(zoom[SHOTS == 3, 0], 0.8, rtol=0.04)
     np.testing.assert_array_equal(zoom[(SHOTS == 0) | (SHOTS == 2), 0], 1)
     np.testing.assert_array_equal(zoom[(SHOTS == 1) | (SHOTS == 3), 1:], np.broadcast_to(MIDDLE, (50, 2)))
-    one_shot = zoom_of_shots(enlarged(talker.landmarks, times), np.zeros_like(SHOTS), HEAD)
-    slightly = zoom_of_shots(enlarged(talker.landmarks, np.exp(0.7 * ENLARGED * (SHOTS == 1))), SHOTS, HEAD)
-    nobody = zoom_of_shots(replace(talker.landmarks, points=points * np.nan), SHOTS, HEAD)
-    assert len(one_shot) == len(slightly) == len(nobody) == 0
+    slightly = zoom_of_frames(enlarged(talker.landmarks, np.exp(0.7 * ENLARGED * (SHOTS == 1))), SHOTS, HEAD)
+    nobody = zoom_of_frames(replace(talker.landmarks, points=points * np.nan), SHOTS, HEAD)
+    assert len(slightly) == len(nobody) == 0
+
+
+def test_pictures_that_grow_within_a_shot_are_told_if_they_grow_quickly() -> None:
+    still = Talker(140, turn=Rotation.from_rotvec(np.zeros((140, 3))))
+    one_shot, uneven = np.zeros(140, np.int32), np.arange(140) / 25 + 0.01 * (np.arange(140) % 3)
+    quickly = np.interp(np.arange(140), [60, 68, 100, 101], [1, 1.3, 1.3, 1])  # and a cut that nobody told
+    for time in (still.landmarks.time, uneven):
+        zoom = zoom_of_frames(replace(enlarged(still.landmarks, quickly), time=time), one_shot, HEAD)
+        expected = np.where(quickly < 1.14, 1.0, quickly)
+        clear = np.abs(quickly - np.exp(ENLARGED)) > 0.04
+        np.testing.assert_allclose(zoom[clear, 0], expected[clear], rtol=0.04)
+    slowly = np.linspace(1, 1.35, 140)
+    assert not len(zoom_of_frames(enlarged(still.landmarks, slowly), one_shot, HEAD))
+    at_a_cut = enlarged(still.landmarks, np.where(np.arange(140) < 70, 1.0, 1.1))
+    assert not len(zoom_of_frames(at_a_cut, (np.arange(140) >= 70).astype(np.int32), HEAD))
+
+
+def test_a_head_that_turns_far_aside_is_not_enlarged(talker: Talker) -> None:
+    """Its size is read wrongly."""
+    aside = slice(60, 68)
+    points = talker.landmarks.points.copy()
+    middle = points[aside].mean(1, keepdims=True)
+    far = Rotation.from_euler("y", 75, degrees=True).as_matrix()
+    points[aside] = 1.25 * (points[aside] - middle) @ far + middle
+    assert not len(zoom_of_frames(replace(talker.landmarks, points=points), np.zeros_like(SHOTS), HEAD))
 
 
 def test_a_face_that_would_come_to_lie_beyond_the_edge_stays_where_it_is(talker: Talker) -> None:
@@ -52,11 +77,11 @@ def test_a_face_that_would_come_to_lie_beyond_the_edge_stays_where_it_is(talker:
     aside[SHOTS == 1, :, 0] -= aside[SHOTS == 1][:, face, 0].min() - 20
     moved = replace(talker.landmarks, points=aside)
     smaller = enlarged(moved, np.where(SHOTS == 1, 0.6, 1.0), np.array([20.0, 300.0]))
-    zoom = zoom_of_shots(smaller, SHOTS, HEAD)
+    zoom = zoom_of_frames(smaller, SHOTS, HEAD)
     assert zoom[60, 0] == pytest.approx(0.6, rel=0.04)
     faces = smaller.points[SHOTS == 1][:, face, :2]
     np.testing.assert_allclose(zoom[60, 1:], (faces.min((0, 1)) + faces.max((0, 1))) / 2, atol=0.1)
-    larger = zoom_of_shots(enlarged(moved, np.where(SHOTS == 1, 1.4, 1.0)), SHOTS, HEAD)
+    larger = zoom_of_frames(enlarged(moved, np.where(SHOTS == 1, 1.4, 1.0)), SHOTS, HEAD)
     np.testing.assert_allclose(larger[60, 1:], MIDDLE)
 
 
