@@ -155,7 +155,7 @@ class FaceFollower:
     @property
     def widest(self) -> F32 | None:
         """[4] px, the widest face in the last picture; a photograph's if there is no other, None without any."""
-        seen = [followed for followed in self._open if followed.frames[-1] == self._latest]
+        seen = [followed for followed in self._open if followed.sightings[-1].frame == self._latest]
         faces = [face for face in seen if not face.still] or seen
         return max((face.box for face in faces), key=lambda box: float(box[2] - box[0]), default=None)
 

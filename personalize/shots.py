@@ -117,12 +117,12 @@ class Changes:
         return whole, (change, same), there
 
 
-def _face_change(rgb: U8, last: U8, box: F32) -> float:
+def _face_change(rgb: U8, last_rgb: U8, box: F32) -> float:
     """Mean grey levels by which two pictures differ above the mouth of a face in a box [4] px."""
-    wide, high = box[2:] - box[:2]
-    top = max(0, round(float(box[1] - ABOVE * high)))
-    left, right = (max(0, round(float(x))) for x in (box[0] - ASIDE * wide, box[2] + ASIDE * wide))
-    parts = [picture[top : round(float(box[1] + DOWN * high)), left:right] for picture in (rgb, last)]
+    (left, top, right, _), (wide, high) = box, box[2:] - box[:2]
+    sides = left - ASIDE * wide, right + ASIDE * wide, top - ABOVE * high, top + DOWN * high
+    first, last, low, end = (max(0, round(float(side))) for side in sides)
+    parts = [picture[low:end, first:last] for picture in (rgb, last_rgb)]
     if not parts[0].size:
         return np.nan
     size = (FACE_SIDE, FACE_SIDE)

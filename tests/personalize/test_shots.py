@@ -66,7 +66,8 @@ def test_a_face_changes_by_what_is_seen_above_its_mouth() -> None:
         (whole, _), _, face = changes.next(shown, [], box)
         assert least <= face <= most and (shown is not captioned or whole > 10)
         assert np.isnan(changes.next(picture, [], None)[2])
-        assert np.isnan(changes.next(picture, [], box + 900)[2])
+        for beyond in (900, -900):
+            assert np.isnan(changes.next(picture, [], box + beyond)[2])
 
 
 def test_a_missing_second_ends_a_shot_and_a_dropped_frame_does_not() -> None:
