@@ -34,8 +34,8 @@ def zoom_of_frames(landmarks: Landmarks, segment: NDArray[np.int32], head: HeadM
     if not len(known):
         return never()
     quick = _quickly(size, landmarks.time, segment)
-    # Stretches of one size; where it changes quickly each frame is one of its own.
-    stretch = np.cumsum(np.diff(segment, prepend=segment[0]).astype(bool) | quick | np.roll(quick, 1))
+    # Stretches of one size; where it changes quickly each frame begins one.
+    stretch = np.cumsum(np.diff(segment, prepend=segment[0]).astype(bool) | quick)
     stretches, number = np.unique(stretch[known], return_inverse=True)
     larger = np.array([np.median(size[known[number == n]]) for n in range(len(stretches))])
     larger -= np.sort(larger[number])[len(known) // 2]

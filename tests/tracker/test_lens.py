@@ -66,6 +66,15 @@ def test_an_enlarged_picture_comes_back_to_its_size_about_its_place() -> None:
     assert Lens(FOCAL, PRINCIPAL, (), zoom).times(np.array([1, 0])).tolist() == [1.5, 1.0]
 
 
+def test_what_is_too_fine_for_the_smaller_picture_is_taken_out() -> None:
+    stripes = np.zeros((60, 80, 3), np.uint8)
+    stripes[:, ::2] = 255
+    zoom = np.array([[1.6, 40, 30]], np.float32)
+    smaller = Lens(FOCAL, PRINCIPAL, (), zoom).picture(stripes, 0)[20:40, 25:55, 0]
+    unblurred = Lens(FOCAL, PRINCIPAL, (), zoom / 1.6).picture(stripes, 0)[20:40, 25:55, 0]
+    assert smaller.std() < 0.25 * unblurred.std() and smaller.mean() == pytest.approx(127, abs=4)
+
+
 def test_a_pinhole_changes_nothing() -> None:
     lens = Lens(FOCAL, PRINCIPAL, ())
     picture, points = np.full((4, 5, 3), 7, np.uint8), np.array([[1.25, np.nan]], np.float32)

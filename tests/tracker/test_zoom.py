@@ -102,6 +102,7 @@ def test_an_enlarged_shot_is_fitted_as_it_was_filmed(talker: Talker) -> None:
 
 def test_pictures_of_an_enlarged_shot_are_refined_as_they_were_filmed() -> None:
     film = filmed(freckled())
+    film.track.valid[:4] = False  # frames are not rows
     times = np.where(np.arange(len(film.pictures)) < 10, 1.25, 1.0)
     about = np.array([159.5, 159.5])
     zoom: F32 = np.column_stack([times, np.broadcast_to(about, (len(times), 2))]).astype(np.float32)
@@ -116,7 +117,7 @@ def test_pictures_of_an_enlarged_shot_are_refined_as_they_were_filmed() -> None:
         refined(film, film.landmarks, film.pictures, None),
         refined(film, shown, pictures, zoom),
     )
-    assert (~np.isnan(zoomed.deviation[:, 0])).all()
+    assert (zoomed.deviation[4:, 0] < 1.3 * plain.deviation[4:, 0]).all()
     assert np.abs(zoomed.track.lip_gap_mm - plain.track.lip_gap_mm).max() < 0.5
     assert np.abs(zoomed.track.rotation - plain.track.rotation).max() < np.radians(0.6)
     as_shown = refined(film, film.landmarks, pictures, None)
