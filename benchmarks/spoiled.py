@@ -1,8 +1,8 @@
 """How a clip is tracked when its film is spoiled, and whether that is told: `python -m benchmarks spoiled VIDEO ...`.
 
 The first seconds of a video are written anew as they are, and spoiled: compressed, in other light, with noise, out of
-focus, without colours, shaken, with things pasted over the mouth, captions written over the chin, cut and enlarged by
-turns, and small in a wide picture. Each goes through the command up to `judge`.
+focus, without colours, shaken, with things pasted over the mouth, captions over the chin, enlarged by turns, and small
+in a wide picture. Each goes through the command up to `judge`.
 
 used            frames that are used by default, %
 bare out        of those that nothing covers or shakes, which are left out; %

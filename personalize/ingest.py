@@ -235,7 +235,7 @@ def _looked_through(media: MediaInfo, progress: Progress) -> _Seen:
     recent = deque[tuple[float, float]](maxlen=min(max(3, round(CUT_WINDOW_S * media.fps)), MOST_WINDOW))
     changes, rows, turns, next_look = Changes(), [], list[F64](), 0.0
     for index, (time, rgb) in enumerate(reader):
-        whole, near, face = changes.next(rgb, follower.boxes, follower.widest)
+        whole, near, face = changes.next(rgb, follower.boxes, follower.foremost)
         rows.append((time, whole, near, face, reader.damaged))
         gap = len(rows) > 1 and time - rows[-2][0] > MAX_GAP_S
         pictures, faces = zip(*recent) if recent else ((), ())

@@ -10,6 +10,8 @@ from itertools import groupby
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial.distance import squareform
 
 from tracker.face_detector import Face, around, holds, overlaps
 from tracker.landmarker import FaceLandmarker, roi_from_face
@@ -24,6 +26,7 @@ MIDDLE = np.s_[PATCH // 4 :, PATCH // 5 : -PATCH // 5]  # of it: no background, 
 BRIGHTEST = 250  # a colour value that the camera may have cut off
 MIN_OVERLAP = 0.3  # intersection over union of a face's boxes from one picture to the next
 SURE_OVERLAP = 0.5  # below which it is looked for once more: a head that is small may be taken for a face
+WIDER = 1.5  # times the foremost face, until another is it
 MAX_LOST_S = 0.4  # a face unseen for longer is another tracklet
 SAMPLE_S = 0.6  # time between two looks at the face's shape
 MIN_PRESENCE = 0.5  # of the landmarker: what it does not take for a face is none, whatever the detector says
@@ -33,10 +36,9 @@ SEARCH_S, SELDOM_S = 1.0, 3.0  # between searches for small faces in tiles: whil
 STILL, STILL_SHARE, STILL_LOOKS = 0.001, 0.75, 4
 PORTRAIT = (12, 14)  # px, width and height of the grey picture that people are told apart by
 # Between 20 people (GRID and four more, 3 s each) a threshold of 2 takes 1 % of pairs for the same person and
-# no pair of one person's shots for two. Of shots of a second and a half it takes one in ten of two men's for another's
-# by one of them, and none by all that are taken.
+# no pair of one person's shots for two.
 SHAPE_SCALE, PORTRAIT_SCALE, OTHER_PERSON = 0.05, 0.25, 2.0
-MOST_PEOPLE = 10  # are tried as the main person, those with the largest tracklets
+TOGETHER = 1e6  # a distance for faces that are seen at once, farther than any on average
 
 
 @dataclass(frozen=True)
@@ -113,12 +115,12 @@ class FaceFollower:
     def __init__(self, landmarker: FaceLandmarker) -> None:
         self._landmarker = landmarker
         self._open: list[Tracklet] = []
-        self._searched, self._latest = -np.inf, -1
+        self._searched = -np.inf
+        self._foremost: Tracklet | None = None
         self.tracklets: list[Tracklet] = []
 
     def add(self, index: int, time: float, rgb: U8, sudden: bool = False) -> None:
         """Look at the next picture [H, W, 3]. sudden: there may be a cut before it, and every face another one."""
-        self._latest = index
         if sudden:
             for followed in self._open:
                 followed.next_sample = time
@@ -146,6 +148,11 @@ class FaceFollower:
                 sample=self._sample(tracklet, time, face, rgb),
             )
             tracklet.sightings.append(sighting)
+        seen = [face for face in self._no_photographs if face.sightings[-1].frame == index]
+        widest = max(seen, key=lambda face: _width(face.box), default=None)
+        same = self._foremost if any(face is self._foremost for face in seen) else None
+        if same is None or widest is None or _width(widest.box) > WIDER * _width(same.box):
+            self._foremost = widest
 
     @property
     def boxes(self) -> list[F32]:
@@ -154,10 +161,20 @@ class FaceFollower:
 
     @property
     def widest(self) -> F32 | None:
-        """[4] px, the widest face in the last picture; a photograph's if there is no other, None without any."""
-        seen = [followed for followed in self._open if followed.sightings[-1].frame == self._latest]
-        faces = [face for face in seen if not face.still] or seen
-        return max((face.box for face in faces), key=lambda box: float(box[2] - box[0]), default=None)
+        """[4] px, where the widest face that is being followed was last seen; a photograph's if there is no other."""
+        return max((face.box for face in self._no_photographs or self._open), key=_width, default=None)
+
+    @property
+    def foremost(self) -> F32 | None:
+        """[4] px of the face in the last picture by which cuts are told, no photograph's; None without any.
+
+        The widest, but the same as before as long as no other is clearly wider: two would differ as at a cut.
+        """
+        return None if self._foremost is None else self._foremost.box
+
+    @property
+    def _no_photographs(self) -> list[Tracklet]:
+        return [followed for followed in self._open if not followed.still]
 
     def _find(self, time: float, rgb: U8) -> list[Face]:
         detector = self._landmarker.detector
@@ -182,6 +199,10 @@ class FaceFollower:
         tracklet.latest.append(points)
         tracklet.still = is_photograph(tracklet.latest)
         return points, _portrait(rgb, points)
+
+
+def _width(box: F32) -> float:
+    return float(box[2] - box[0])
 
 
 def apart(faces: list[Face]) -> list[Face]:
@@ -273,7 +294,8 @@ class Looks:
     def distances(self, one: int) -> F64:
         """[n] of all from one of them: difference of the shapes, and lack of correlation of the portraits."""
         shape = np.linalg.norm(self.shapes - self.shapes[one], axis=1)
-        return shape / SHAPE_SCALE + (1 - self.portraits @ self.portraits[one]) / PORTRAIT_SCALE
+        alike = np.minimum(self.portraits @ self.portraits[one], 1.0)
+        return shape / SHAPE_SCALE + (1 - alike) / PORTRAIT_SCALE
 
 
 def _of_norm_1(rows: F64) -> F64:
@@ -287,40 +309,24 @@ def main_person(tracklets: list[Tracklet]) -> tuple[list[Tracklet], list[Trackle
     """
     faces = [t for t in tracklets if t.shapes]
     people = [t for t in faces if not is_photograph(t.shapes)] or faces
-    best: list[Tracklet] = []
-    rest = sorted(people, key=lambda t: -t.weight)
-    for _ in range(MOST_PEOPLE):
-        if not rest:
-            break
-        same = _same_person(rest[0], people)
-        # The one found first, in the largest tracklet, unless another is clearly more in the picture.
-        if sum(t.weight for t in same) > 1.05 * sum(t.weight for t in best):
-            best = same
-        theirs = {id(t) for t in same}
-        rest = [t for t in rest if id(t) not in theirs]
+    persons = [[people[row] for row in rows] for rows in _persons(people)]
+    best = max(persons, key=lambda same: sum(t.weight for t in same), default=[])
     mine = {id(t) for t in best}
     return best, [t for t in faces if id(t) not in mine]
 
 
-def _same_person(seed: Tracklet, faces: list[Tracklet]) -> list[Tracklet]:
-    """Tracklets that look like `seed`, and like each other, the most alike first.
+def _persons(faces: list[Tracklet]) -> list[NDArray[np.int64]]:
+    """Rows of faces that look like each other, person by person.
 
-    In two seconds a face shows but part of how it looks, so the distance from all that are taken counts, on average.
-    What looks unlike all that was found by it is alone. Nobody is in two places at once: of faces seen together, the
-    most alike.
+    In two seconds a face shows but part of how it looks, so the distance of all from all counts, on average. Nobody is
+    in two places at once.
     """
-    looks = Looks.of(faces, np.asarray(seed.shapes[0], np.float64))
-    taken: list[int] = []
-    frames = set[int]()
-    waiting, far = set(range(len(faces))), np.zeros(len(faces))
-    first = nearest = faces.index(seed)
-    while True:
-        waiting.remove(nearest)
-        if frames.isdisjoint(faces[nearest].frames):
-            taken.append(nearest)
-            frames.update(faces[nearest].frames)
-            far += looks.distances(nearest)
-        nearest = min(waiting, key=lambda i: float(far[i]), default=-1)
-        if nearest < 0 or far[nearest] > OTHER_PERSON * len(taken):
-            alone = far[first] > OTHER_PERSON * (len(taken) - 1)
-            return [seed] if alone else [faces[i] for i in taken]
+    if len(faces) < 2:
+        return [np.arange(len(faces))] * len(faces)
+    looks = Looks.of(faces, np.asarray(max(faces, key=lambda t: t.weight).shapes[0], np.float64))
+    apart = np.stack([looks.distances(row) for row in range(len(faces))])
+    first, last = np.array([(face.frames[0], face.frames[-1]) for face in faces]).T
+    apart[(first[:, None] <= last) & (first <= last[:, None])] = TOGETHER
+    np.fill_diagonal(apart, 0.0)
+    number = fcluster(linkage(squareform(apart, checks=False), "average"), OTHER_PERSON, "distance")
+    return [np.flatnonzero(number == one) for one in np.unique(number)]

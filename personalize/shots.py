@@ -31,11 +31,11 @@ MAX_GAP_S = 0.25  # a longer time between two pictures ends a shot: nothing is k
 MIN_SHOT_S = 0.5  # shorter shots are left out: too little to track
 # A cut changes the picture by so much (grey levels, mean) and so many times more than its neighbours in time.
 CUT_LEVEL, CUT_RATIO, CUT_WINDOW_S = 1.5, 1.9, 0.28
-# What lies above the mouth of the widest face, its hair too: shares of its box beyond its sides and its top, and of its
-# height. A caption or a slide that comes changes much of the picture, and nothing there. In 8 real clips with captions
-# written in and moments left out, the ratio is 1.2 at most at 98 % of captions, and less than that at 2 % of those cuts
-# that the picture tells (all of one man's, who moves fast); where nothing is cut, up to 2.4 in them and 1.7 in 600
-# films. Of compressed film a part of the face may stand still and jump, but the rest of the picture does not then.
+# What lies above the mouth of the foremost face, its hair too: shares of its box beyond its sides and its top, and of
+# its height. A caption or a slide that comes changes much of the picture, and nothing there. In 8 real clips with
+# captions written in and moments left out, the ratio is 1.2 at most at 98 % of captions, and less than that at 2 % of
+# those cuts that the picture tells (all of one man's, who moves fast); where nothing is cut, up to 2.4 in them and 1.7
+# in 600 films. Of compressed film a part of the face may stand still and jump, but the rest of the picture does not.
 ASIDE, ABOVE, DOWN, FACE_SIDE = 0.1, 0.3, 0.6, 32
 FACE_STAYS, FACE_JUMPS = 1.2, 3.0
 USUAL_CHANGE = 0.5  # grey levels, that any two pictures differ by
@@ -94,13 +94,13 @@ class Changes:
         self._last: tuple[U8, F32] | None = None
 
     def next(
-        self, rgb: U8, faces: Sequence[F32], widest: F32 | None
+        self, rgb: U8, faces: Sequence[F32], foremost: F32 | None
     ) -> tuple[tuple[float, bool], tuple[float, bool], float]:
         """How it differs (see `difference`): the whole, that or what surrounds a small face, and above a mouth.
 
         faces: [4] px, their boxes in the last picture. Where one is small in a picture that stands still, as of
-        somebody who shows their screen, its motion is next to nothing of the whole: whichever is most. widest: the box
-        of the face above whose mouth the third is told, mean grey levels; NaN without one.
+        somebody who shows their screen, its motion is next to nothing of the whole: whichever is most. foremost: the
+        box of the face above whose mouth the third is told, mean grey levels; NaN without one.
         """
         grey, before = thumbnail(rgb), self._last
         self._last = rgb, grey
@@ -113,7 +113,7 @@ class Changes:
                     *(thumbnail(around(picture, face)[0]) for picture in (rgb, before[0]))
                 )
                 change, same = max(change, nearby), same and alike
-        there = np.nan if widest is None else _face_change(rgb, before[0], widest)
+        there = np.nan if foremost is None else _face_change(rgb, before[0], foremost)
         return whole, (change, same), there
 
 
@@ -166,9 +166,9 @@ def repeated(time: F64, change: F64, same: Bool) -> Bool:
 def find_shots(time: F64, change: F64, face: F64) -> NDArray[np.int32]:
     """Number [T] of the uninterrupted shot of each frame.
 
-    change, face: [T] grey levels by which each differs from the one before, as a whole and above the widest mouth (NaN
-    where none is seen); see `Changes`. A picture that changes around a face that stays is no cut, and a face that jumps
-    is one even if the rest changes no more than around it.
+    change, face: [T] grey levels by which each differs from the one before, as a whole and above the foremost mouth
+    (NaN where none is seen); see `Changes`. A picture that changes around a face that stays is no cut, and a face that
+    jumps is one even if the whole changes no more than around it.
     """
     step = np.diff(time, prepend=time[0] - 1.0)
     # Pictures that are further apart differ more without any cut.
@@ -185,11 +185,12 @@ def find_shots(time: F64, change: F64, face: F64) -> NDArray[np.int32]:
 
 
 def _standing_out(rate: F64, window: int) -> F64:
-    """[T] how many times a rate [T] is that of the frames around it, so many to both sides."""
-    padded = np.nan_to_num(np.pad(rate, window, mode="reflect" if len(rate) > window else "edge"))
+    """[T] how many times a rate [T] is that of the frames around it, so many to both sides; NaN if few are known."""
+    padded = np.pad(rate, window, mode="reflect" if len(rate) > window else "edge")
     around = np.stack([padded[i : i + len(rate)] for i in range(2 * window + 1) if i != window])
     # The second largest, so that two cuts near each other are both found.
-    return rate / (np.sort(around, axis=0)[-2] + USUAL_CHANGE)
+    usual = np.sort(np.nan_to_num(around), axis=0)[-2] + USUAL_CHANGE
+    return np.where(np.isnan(around).mean(0) < 0.5, rate / usual, np.nan)
 
 
 def _usual_step(time: F64) -> float:

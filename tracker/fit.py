@@ -64,8 +64,8 @@ def fit_track(
     weights = Weights()
     model = landmark_model(head, weights)
     good = _measurable(landmarks, model, usable)
-    straight = landmarks.through(camera.lens).points[good].astype(np.float64)
-    observed = straight[..., :2]
+    straight = landmarks.through(camera.lens).points[good]
+    observed = straight[..., :2].astype(np.float64)
     energy, start = _start(model, weights, camera, straight)
     share, sound = _share(evidence, good), trusted(evidence, good)
     keys = key_frames(observed[sound], energy.px_per_m[sound]).of(sound)
@@ -99,9 +99,9 @@ def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.b
     return good
 
 
-def _start(model: LandmarkModel, weights: Weights, camera: Camera, straight: F64) -> tuple[Energy, F64]:
+def _start(model: LandmarkModel, weights: Weights, camera: Camera, straight: F32) -> tuple[Energy, F64]:
     """The clip's energy, and poses of the mean head by Procrustes against landmarks [n, 478, 3] with their depth."""
-    seen = straight[:, model.landmarks]
+    seen = straight[:, model.landmarks].astype(np.float64)
     px_per_m, matrix, _ = similarity(model.mean, seen)
     centre = seen.mean(1)
     principal = np.array(camera.principal_px, np.float64)
@@ -109,7 +109,7 @@ def _start(model: LandmarkModel, weights: Weights, camera: Camera, straight: F64
     translation = ray / px_per_m[:, None]
     rotation = rotation_vector(matrix)
     x = np.concatenate([np.zeros((len(seen), model.expressions)), rotation, translation], axis=1)
-    return _energy(model, weights, camera, straight[..., :2], px_per_m, x), x
+    return _energy(model, weights, camera, straight[..., :2].astype(np.float64), px_per_m, x), x
 
 
 def _energy(

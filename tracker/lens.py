@@ -33,11 +33,7 @@ class Lens:
 
     def points(self, xy: NDArray[np.floating], frames: NDArray[np.integer]) -> F64:
         """Points [n, ..., 2] px of the frames [n] as a camera without distortion and zoom would see them."""
-        flat = xy.astype(np.float64)
-        if len(self.zoom):
-            about = self.zoom[frames, 1:].astype(np.float64).reshape(-1, *[1] * (flat.ndim - 2), 2)
-            times = self.times(frames).reshape(-1, *[1] * (flat.ndim - 1))
-            flat = about + (flat - about) / times
+        flat = self._smaller(xy.astype(np.float64), frames)
         if not self.distortion or not flat.size:
             return flat
         matrix, coefficients = self._opencv()
@@ -61,9 +57,21 @@ class Lens:
             )
         return cv2.undistort(rgb, *self._opencv()) if self.distortion else rgb
 
+    def ends(self, size: tuple[int, int], frames: NDArray[np.integer]) -> F64:
+        """[n, 2, 2] px, first and last (x, y) that the frames [n] show of pictures of this size, without the zoom."""
+        corners = np.tile([[0.0, 0.0], [size[0] - 1, size[1] - 1]], (len(frames), 1, 1))
+        return np.clip(self._smaller(corners, frames), corners[:, :1], corners[:, 1:])
+
     def times(self, frames: NDArray[np.integer]) -> F64:
         """[n] times that the pictures of the frames [n] are enlarged."""
         return self.zoom[frames, 0].astype(np.float64) if len(self.zoom) else np.ones(len(frames))
+
+    def _smaller(self, xy: F64, frames: NDArray[np.integer]) -> F64:
+        """Points [n, ..., 2] px of the frames [n] without the zoom."""
+        if not len(self.zoom):
+            return xy
+        about = self.zoom[frames, 1:].astype(np.float64).reshape(-1, *[1] * (xy.ndim - 2), 2)
+        return about + (xy - about) / self.times(frames).reshape(-1, *[1] * (xy.ndim - 1))
 
     def _opencv(self) -> tuple[F64, F64]:
         """Camera matrix [3, 3] and distortion [5]."""

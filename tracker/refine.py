@@ -102,7 +102,7 @@ def refine_track(
     if not len(good):
         return Refined(track, unknown)
     sound = trusted(evidence, good)
-    subject = Subject.of(head, track.identity, energy, observed, camera.size)
+    subject = Subject.of(head, track.identity, energy, observed, camera.lens.ends(camera.size, good))
     lines = LipLines.across(observed, energy.px_per_m, x)
     count = int(np.clip(len(sound) // KEYS_APART, *KEYS))
     usual = sound[np.linspace(0, len(sound) - 1, count).round().astype(int)]

@@ -86,15 +86,14 @@ class Subject:
     photometry: Photometry
 
     @classmethod
-    def of(
-        cls, head: HeadModel, identity: F32, energy: Energy, observed: F64, size: tuple[int, int]
-    ) -> Subject:
+    def of(cls, head: HeadModel, identity: F32, energy: Energy, observed: F64, ends: F64) -> Subject:
         """The subject with sample points on the skin and windows around the landmarks.
 
-        observed: [n, 478, 2] px; a user's head may know few of them, with no chin. size: of the pictures, px.
+        observed: [n, 478, 2] px; a user's head may know few of them, with no chin. ends: [n, 2, 2] px,
+        first and last (x, y) of the pictures.
         """
         photometry = Photometry()
-        window = Window.around(observed, energy.px_per_m, photometry.finest_px_per_m, size)
+        window = Window.around(observed, energy.px_per_m, photometry.finest_px_per_m, ends)
         weights = replace(
             energy.weights,
             pair_noise_mm=photometry.pair_noise_mm,
@@ -145,7 +144,7 @@ class Subject:
 
     def photometric(self, cuts: Sequence[U8], rows: Index, seen: F32, blur_px: float) -> PhotometricEnergy:
         """Energy of some frames through one blur; nothing is expected of the skin yet."""
-        window = replace(self.window, origin=self.window.origin[rows])
+        window = self.window.select(rows)
         skin = self.skin.to_inside * self.px_per_m > self.photometry.edge_blurs * blur_px
         return PhotometricEnergy(
             landmarks=self.energy.select(rows),

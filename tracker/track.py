@@ -41,6 +41,8 @@ class Landmarks:
 
     def through(self, lens: Lens) -> Landmarks:
         """As a camera without distortion and zoom would see them."""
+        if not lens.distortion and not len(lens.zoom):
+            return self
         frames = np.arange(len(self.points))
         depth = self.points[..., 2:] / lens.times(frames)[:, None, None]
         points = np.concatenate([lens.points(self.points[..., :2], frames), depth], axis=-1)
@@ -99,8 +101,8 @@ class Track:
     3] m. focal px. principal: [2] px. distortion: [0..3] radial coefficients, and zoom: [T, 3] or [0, 3], see
     `Lens`; both go between the pinhole and the picture. size: (width, height).
     head: `name@sha256` of the head model. lip_gap_mm: [T]. reprojection_px: [T], mean over landmarks, from where they
-    lie without distortion; refined, inner lips' as the colours have them. Rows of invalid frames are finite and tell
-    nothing: the nearest good pose, or another tracker's own.
+    lie without distortion and zoom; refined, inner lips' as the colours have them. Rows of invalid frames are finite
+    and tell nothing: the nearest good pose, or another tracker's own.
     """
 
     time: F64

@@ -40,16 +40,16 @@ class Window:
     """Where the face lies in each of n pictures: q of the whole picture is at (q - origin + 1/2) * scale - 1/2.
 
     origin: [n, 2] px of the whole picture, whole numbers. scale: at most 1. size: (width, height) of what is cut out.
-    whole: that of the whole picture.
+    ends: [n, 2, 2] px, first and last (x, y) that the whole picture shows.
     """
 
     origin: F64
     scale: float
     size: tuple[int, int]
-    whole: tuple[int, int]
+    ends: F64
 
     @classmethod
-    def around(cls, observed: F64, px_per_m: F64, finest_px_per_m: float, whole: tuple[int, int]) -> Window:
+    def around(cls, observed: F64, px_per_m: F64, finest_px_per_m: float, ends: F64) -> Window:
         """Windows of one size around landmarks [n, L, 2] px, shrunk to `finest_px_per_m` in the clip's median.
 
         They hold the largest face, but for one that is more than LARGEST times the usual.
@@ -59,7 +59,11 @@ class Window:
         extent = np.minimum((high - low).max(0), LARGEST * np.median(high - low, axis=0))
         size = np.ceil(extent * MARGIN * scale).astype(int)
         origin = np.floor((low + high) / 2 - size / scale / 2)
-        return cls(origin, scale, (int(size[0]), int(size[1])), whole)
+        return cls(origin, scale, (int(size[0]), int(size[1])), ends)
+
+    def select(self, rows: Rows) -> Window:
+        """Those of some of the pictures."""
+        return replace(self, origin=self.origin[rows], ends=self.ends[rows])
 
     def cut(self, rgb: U8, row: int) -> U8:
         """[height, width] u8 grey; outside of the picture its border goes on."""
@@ -83,8 +87,7 @@ class Window:
 
         margin: px farther in where it does, of a blur that takes the border along.
         """
-        ends = np.array([(0.0, 0.0), np.array(self.whole) - 1.0])
-        first, last = (ends - self.origin[row] + 0.5) * self.scale - 0.5
+        first, last = (self.ends[row] - self.origin[row] + 0.5) * self.scale - 0.5
         edge = np.array(self.size) - 1.0
         return np.stack([np.where(first > 0, first + margin, 0), np.where(last < edge, last - margin, edge)])
 
@@ -110,7 +113,7 @@ class View:
 
     def select(self, rows: Rows) -> View:
         """Some of the pictures."""
-        return View(self.grey[rows], replace(self.window, origin=self.window.origin[rows]))
+        return View(self.grey[rows], self.window.select(rows))
 
     def read(self, points: F32, focal: float, principal: F64) -> tuple[F32, F32]:
         """Grey levels [n, P] where points [n, P, 3] m of the camera frame lie, and their slopes [n, P, 3] per m.

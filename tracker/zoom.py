@@ -34,17 +34,19 @@ def zoom_of_frames(landmarks: Landmarks, segment: NDArray[np.int32], head: HeadM
     if not len(known):
         return never()
     quick = _quickly(size, landmarks.time, segment)
-    # Stretches of one size; where it changes quickly each frame begins one.
-    stretch = np.cumsum(np.diff(segment, prepend=segment[0]).astype(bool) | quick)
+    # Stretches of one size, and frames in which it changes.
+    stretch = np.cumsum(np.diff(segment, prepend=segment[0]).astype(bool) | quick | np.roll(quick, 1))
     stretches, number = np.unique(stretch[known], return_inverse=True)
     larger = np.array([np.median(size[known[number == n]]) for n in range(len(stretches))])
     larger -= np.sort(larger[number])[len(known) // 2]
+    enlarged = np.abs(larger) > ENLARGED
+    enlarged[number[quick[known]]] = True
     zoom = np.zeros((len(segment), 3))
     zoom[:, 0] = 1.0
-    for n in np.flatnonzero(np.abs(larger) > ENLARGED):
+    for n in np.flatnonzero(enlarged):
         faces = landmarks.points[known[number == n]][:, head.landmark_embedding.landmarks, :2]
         zoom[stretch == stretches[n]] = _about(np.exp(larger[n]), faces, landmarks.size)
-    return zoom.astype(np.float32) if (zoom[:, 0] != 1).any() else never()
+    return zoom.astype(np.float32) if enlarged.any() else never()
 
 
 def _sizes(landmarks: Landmarks, head: HeadModel) -> F64:

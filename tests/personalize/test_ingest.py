@@ -49,7 +49,7 @@ def follow_one(
     """Let a clip show one face, whose eyes lie `across` [2] px from each other; see FaceFollower for widest."""
     for shape in face.shapes:
         shape[LEFT_EYE_OUTER, :2] = shape[RIGHT_EYE_OUTER, :2] + across
-    follower = Mock(tracklets=[face], widest=widest, boxes=[])
+    follower = Mock(tracklets=[face], widest=widest, foremost=None, boxes=[])
     monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: follower)
 
 
@@ -71,7 +71,7 @@ def test_how_closely_is_looked_is_decided_once_for_a_clip(
     looked: list[np.ndarray] = []
     monkeypatch.setattr(
         "personalize.ingest.Changes",
-        lambda: Mock(next=lambda rgb, faces, widest: ((1.0, False), (5.0, False), np.nan)),
+        lambda: Mock(next=lambda rgb, faces, foremost: ((1.0, False), (5.0, False), np.nan)),
     )
     monkeypatch.setattr(
         "personalize.ingest.repeated", lambda time, change, same: looked.append(change) or same
@@ -89,7 +89,7 @@ def test_how_closely_is_looked_is_decided_once_for_a_clip(
         assert (set(looked.pop()), set(looked.pop())) == ({cuts}, {repeats})
     # Beside a photograph, which is the widest.
     face, photograph = tracklet(1, range(60), width=12), tracklet(2, range(60), width=40)
-    follower = Mock(tracklets=[photograph, face], widest=None, boxes=[])
+    follower = Mock(tracklets=[photograph, face], widest=None, foremost=None, boxes=[])
     monkeypatch.setattr("personalize.ingest.FaceFollower", lambda _: follower)
     find_usable(probe(path))
     assert (set(looked.pop()), set(looked.pop())) == ({1.0}, {5.0})

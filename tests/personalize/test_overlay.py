@@ -12,7 +12,7 @@ from personalize.overlay import COLUMNS, SPREAD, WORST, check_modes, notable_fra
 from personalize.pictures import FrameReader
 from personalize.quality import write_quality
 from personalize.render.track import BAD, FOOTER, GOOD, PANEL, TILE, TrackPictures, around_face, grid
-from personalize.run import RunFolder, write_landmarks, write_track
+from personalize.run import RunFolder, read_camera, read_track, write_camera, write_landmarks, write_track
 from personalize.settings import Settings
 from personalize.sound import read_audio
 from personalize.stages import Overlay
@@ -20,6 +20,7 @@ from tests.personalize.video_factory import clicks, write_video
 from tests.tracker.turning_head import picture, shifted_landmarks, turning_track
 from tracker.head import load_head
 from tracker.overlay import MODES
+from tracker.track import Bundle, Camera
 
 FRAMES, LEFT_OUT = 6, 4
 
@@ -149,11 +150,28 @@ def test_the_same_film_is_made_twice(run: RunFolder, tmp_path: Path) -> None:
         assert (first / name).read_bytes() == (second / name).read_bytes()
 
 
-def test_the_lens_is_taken_out_of_what_is_shown(run: RunFolder) -> None:
+@pytest.mark.parametrize("bends", [True, False])
+def test_lens_and_zoom_are_taken_out_of_what_is_shown(run: RunFolder, bends: bool) -> None:
     pictures = TrackPictures.of(run, load_head(), ("landmarks",))
-    bent = dataclasses.replace(pictures.track, distortion=np.array([-0.5], np.float32))
+    zoom = np.tile(np.float32([1.3, 100, 80]), (FRAMES, 1))
+    made = {"distortion": np.array([-0.5], np.float32)} if bends else {"zoom": zoom}
+    seen = dataclasses.replace(pictures.track, **made)
     rgb = np.random.default_rng(0).integers(0, 255, (*pictures.landmarks.size[::-1], 3)).astype(np.uint8)
     width, height = pictures.crop.size
-    shown = dataclasses.replace(pictures, track=bent).film(rgb, LEFT_OUT)[60:height, :width]
-    expected = pictures.crop.picture(bent.lens.picture(rgb, 0))[60:height]
+    shown = dataclasses.replace(pictures, track=seen).film(rgb, LEFT_OUT)[60:height, :width]
+    expected = pictures.crop.picture(seen.lens.picture(rgb, LEFT_OUT))[60:height]
     assert (shown == expected).mean() > 0.99 and (shown == pictures.crop.picture(rgb)[60:height]).mean() < 0.5
+
+
+def test_zoom_is_kept_with_the_camera_and_the_track(run: RunFolder, tmp_path: Path) -> None:
+    zoom = np.tile(np.float32([1.3, 100, 80]), (FRAMES, 1))
+    track = dataclasses.replace(read_track(run.path / "refine/track.npz"), zoom=zoom)
+    write_track(tmp_path / "track.npz", track)
+    np.testing.assert_array_equal(read_track(tmp_path / "track.npz").lens.zoom, zoom)
+    nothing = np.zeros((0, 3), np.float32)
+    camera = Camera(900.0, 0.1, (159.5, 119.5), (), (320, 240), "bundle", "", zoom)
+    bundle = Bundle(np.zeros(0, np.int32), nothing, nothing, nothing, np.zeros((0, 4), np.float32))
+    write_camera(tmp_path, camera, bundle)
+    again, _ = read_camera(tmp_path)
+    np.testing.assert_array_equal(again.lens.zoom, zoom)
+    assert again.focal_px == 900 and "zoom" not in (tmp_path / "camera.json").read_text()

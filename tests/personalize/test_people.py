@@ -191,9 +191,26 @@ def test_the_widest_face_is_no_photograph_unless_it_is_alone() -> None:
     detector.whole = [photograph]
     follow(detector, range(121, 150), follower)
     assert follower.widest.tolist() == photograph.box.tolist()
-    detector.whole = []
-    follow(detector, range(150, 151), follower)
-    assert follower.widest is None and follower.boxes  # followed on, but not seen
+
+
+def test_cuts_are_told_by_one_face_as_long_as_no_other_is_clearly_wider() -> None:
+    one, alike, wide = face(20, 20, 120, 120), face(130, 20, 250, 120), face(0, 0, 256, 256)
+    detector = Detector([one])
+    follower = follow(detector, range(2))
+    steps = (
+        *(([one, alike], one), ([alike, one], one), ([alike], alike), ([one, alike], alike)),
+        *(([wide], wide), ([], None), ([one], one)),
+    )
+    for index, (whole, foremost) in enumerate(steps, 2):
+        detector.whole = whole
+        follow(detector, range(index, index + 1), follower)
+        told = follower.foremost
+        assert (told is None) == (foremost is None)
+        assert told is None or foremost is None or told.tolist() == foremost.box.tolist()
+    for followed in follower.tracklets:
+        followed.still = True  # photographs
+    follow(detector, range(9, 10), follower)
+    assert follower.foremost is None and follower.widest is not None
 
 
 def test_behind_a_cut_a_face_is_looked_at_anew_however_shortly_it_is_seen() -> None:

@@ -66,6 +66,14 @@ def test_an_enlarged_picture_comes_back_to_its_size_about_its_place() -> None:
     assert Lens(FOCAL, PRINCIPAL, (), zoom).times(np.array([1, 0])).tolist() == [1.5, 1.0]
 
 
+def test_where_an_enlarged_picture_ends() -> None:
+    """What is made smaller is less than the whole, and what is made larger no more."""
+    zoom = np.array([[1, 0, 0], [2, 100, 200], [0.5, 319.5, 239.5]], np.float32)
+    ends = Lens(FOCAL, PRINCIPAL, (), zoom).ends((640, 480), np.array([2, 1, 0]))
+    whole = [[0, 0], [639, 479]]
+    np.testing.assert_allclose(ends, [whole, [[50, 100], [369.5, 339.5]], whole])
+
+
 def test_what_is_too_fine_for_the_smaller_picture_is_taken_out() -> None:
     stripes = np.zeros((60, 80, 3), np.uint8)
     stripes[:, ::2] = 255

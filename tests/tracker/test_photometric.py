@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.flame_factory import FakeFlame
 from tests.tracker.test_flame import arrays, surface
+from tests.tracker.test_view import whole
 from tests.tracker.turning_head import first_hits
 from tracker.appearance import (
     FACING,
@@ -60,7 +61,7 @@ def energy_and_x() -> tuple[PhotometricEnergy, np.ndarray]:
         strictness=np.ones(frames),
     )
     landmarks.observed[:] = landmarks.project(MODEL.mean, x) + rng.normal(size=landmarks.observed.shape)
-    window = Window(np.array([[70.0, -10.0], [72.0, -11.0]]), 0.8, SIZE, SIZE)
+    window = Window(np.array([[70.0, -10.0], [72.0, -11.0]]), 0.8, SIZE, whole(*SIZE, 2))
     grey = np.stack([saddle(SIZE, twist) for twist in (15.0, -12.0)])
     skin = skin_of(HEAD, MODEL, IDENTITY)
     energy = PhotometricEnergy(
@@ -108,7 +109,7 @@ def test_landmarks_and_skin_curve_the_energy_together(energy_and_x):
 
 def test_view_reads_a_ramp_exactly_and_is_flat_outside():
     ramp = (3 * np.arange(40)[None, :] + 2 * np.arange(30)[:, None]).astype(np.float32)
-    view = View(ramp[None], Window(np.array([[100.0, 50.0]]), 0.5, (40, 30), (640, 640)))
+    view = View(ramp[None], Window(np.array([[100.0, 50.0]]), 0.5, (40, 30), whole(640, 640)))
     inside, outside = [120.3, 71.7], [90.0, 60.0]
     depth = 2.0
     points = [[depth * (x - 110) / 300, depth * (y - 60) / 300, depth] for x, y in (inside, outside)]
@@ -123,17 +124,17 @@ def test_view_reads_a_ramp_exactly_and_is_flat_outside():
 def test_window_cuts_what_lies_outside_as_its_border():
     rgb = np.zeros((20, 30, 3), np.uint8)
     rgb[:, :2] = 200
-    inside = Window(np.array([[-6.0, 4.0]]), 1.0, (10, 8), (640, 640)).cut(rgb, 0)
+    inside = Window(np.array([[-6.0, 4.0]]), 1.0, (10, 8), whole(640, 640)).cut(rgb, 0)
     assert inside.shape == (8, 10)
     assert (inside[:, :8] == 200).all() and (inside[:, 8:] == 0).all()
-    assert Window(np.array([[500.0, -90.0]]), 0.5, (10, 8), (640, 640)).cut(rgb, 0).shape == (8, 10)
+    assert Window(np.array([[500.0, -90.0]]), 0.5, (10, 8), whole(640, 640)).cut(rgb, 0).shape == (8, 10)
 
 
 @pytest.mark.parametrize("scale", [0.7, 0.5, 0.36, 0.23])
 def test_a_cut_picture_shows_what_its_window_says_however_much_it_is_shrunk(scale: float):
     across, down = np.meshgrid(np.arange(700), np.arange(900))
     rgb = np.stack([0.2 * across + 0.1 * down] * 3, axis=-1).round().astype(np.uint8)
-    window = Window(np.array([[31.0, 42.0]]), scale, (130, 150), (640, 640))
+    window = Window(np.array([[31.0, 42.0]]), scale, (130, 150), whole(640, 640))
     places = [(np.arange(side) + 0.5) / scale - 0.5 for side in window.size]
     wanted = 0.2 * (places[0] + 31)[None, :] + 0.1 * (places[1] + 42)[:, None]
     error = window.cut(rgb, 0) - wanted
@@ -262,7 +263,7 @@ def test_skin_moves_as_a_flame_head_does():
 
 
 def test_lids_move_as_fast_as_the_landmarks_say(energy_and_x):
-    window = Window(np.zeros((1, 2)), 1.0, SIZE, SIZE)
+    window = Window(np.zeros((1, 2)), 1.0, SIZE, whole(*SIZE))
     skin = energy_and_x[0]
     subject = Subject(HEAD, IDENTITY, skin.landmarks, skin.skin, window, Photometry(smoothness=20.0))
     factor = dict(zip(HEAD.expression_names, subject.smoothness))

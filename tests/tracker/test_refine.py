@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.tracker.test_view import whole
 from tracker import refine
 from tracker.confidence import judge
 from tracker.energy import LIP_PAIRS, rotation_matrix
@@ -155,7 +156,10 @@ def test_how_fine_the_light_is_is_told_by_the_whole_clip(dark_mouth: Film, monke
 def test_what_moves_all_key_frames_alike_is_taken_for_an_error_of_the_albedo(film: Film):
     """Grey levels tell how frames differ: their mean stays where landmarks have it."""
     energy, x, observed, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
-    subject, rows = Subject.of(HEAD, film.track.identity, energy, observed, SIZE), np.arange(0, FRAMES, 3)
+    subject, rows = (
+        Subject.of(HEAD, film.track.identity, energy, observed, whole(*SIZE, len(observed))),
+        np.arange(0, FRAMES, 3),
+    )
     cuts, x = [subject.window.cut(film.pictures[row], row) for row in rows], x[rows]
     levels, alone = learn_levels(subject, cuts, rows, x), Smoothness.none(*x.shape)
     free = [replace(level, pull=0 * level.pull) for level in levels]
@@ -170,10 +174,13 @@ def test_what_moves_all_key_frames_alike_is_taken_for_an_error_of_the_albedo(fil
 def test_skin_beside_the_mouths_inside_is_not_compared(film: Film):
     """What a blur mixes with teeth and dark: the coarser it is, the more."""
     energy, _, observed, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
-    subject, rows = Subject.of(HEAD, film.track.identity, energy, observed, SIZE), np.zeros(1, np.int64)
-    cut, whole = subject.window.cut(film.pictures[0], 0), np.ones((1, len(subject.skin)), np.float32)
+    subject, rows = (
+        Subject.of(HEAD, film.track.identity, energy, observed, whole(*SIZE, len(observed))),
+        np.zeros(1, np.int64),
+    )
+    cut, everything = subject.window.cut(film.pictures[0], 0), np.ones((1, len(subject.skin)), np.float32)
     for blur_px in (1.0, 3.0):
-        seen = subject.photometric([cut], rows, whole, blur_px).seen[0]
+        seen = subject.photometric([cut], rows, everything, blur_px).seen[0]
         beside = subject.skin.to_inside < 0.99 * blur_px / (np.median(energy.px_per_m) * subject.window.scale)
         assert not seen[beside].any() and beside.sum() > 3
         np.testing.assert_allclose(seen[subject.skin.to_inside > 0.005], 0.1)
@@ -188,7 +195,7 @@ def test_a_head_that_knows_few_landmarks_has_its_chin_in_the_window(film: Film):
     seen = []
     for head in (HEAD, sparse):
         energy, x, observed, _ = resume(film.track, film.landmarks, CAMERA, head)
-        subject = Subject.of(head, film.track.identity, energy, observed, SIZE)
+        subject = Subject.of(head, film.track.identity, energy, observed, whole(*SIZE, len(observed)))
         seen.append(subject.look(np.zeros(1, np.int64), x[:1])[0][0])
     assert seen[0].sum() > 1000
     np.testing.assert_array_equal(*seen)
@@ -197,10 +204,13 @@ def test_a_head_that_knows_few_landmarks_has_its_chin_in_the_window(film: Film):
 def test_skin_outside_of_the_picture_is_not_seen(film: Film):
     energy, x, observed, _ = resume(film.track, film.landmarks, CAMERA, HEAD)
     first, size = np.zeros(1, np.int64), (SIZE[0], 150)
-    whole, cut = (Subject.of(HEAD, film.track.identity, energy, observed, s) for s in (SIZE, size))
-    seen, fewer = (subject.look(first, x[first])[0][0] > 0 for subject in (whole, cut))
+    uncut, cut = (
+        Subject.of(HEAD, film.track.identity, energy, observed, whole(*s, len(observed)))
+        for s in (SIZE, size)
+    )
+    seen, fewer = (subject.look(first, x[first])[0][0] > 0 for subject in (uncut, cut))
     # In the first frame the face is at rest.
-    place = whole.skin.rest @ rotation_matrix(x[:1, -6:-3])[0].T + x[0, -3:]
+    place = uncut.skin.rest @ rotation_matrix(x[:1, -6:-3])[0].T + x[0, -3:]
     y = FOCAL * place[:, 1] / place[:, 2] + CAMERA.principal_px[1]
     assert 0.1 < fewer.sum() / seen.sum() < 0.9
     assert not fewer[y > size[1] - 1].any()
@@ -222,7 +232,10 @@ def test_what_landmarks_read_of_shut_lips_is_forgotten_when_colours_read_them(fi
     far = replace(energy, model=replace(energy.model, touch=energy.model.touch + 0.001))
     near, apart = (
         _with_landmarks(
-            Subject.of(HEAD, film.track.identity, start, observed, SIZE), read, x, sound
+            Subject.of(HEAD, film.track.identity, start, observed, whole(*SIZE, len(observed))),
+            read,
+            x,
+            sound,
         ).energy.model
         for start in (energy, far)
     )
