@@ -8,6 +8,7 @@ used            frames that are used by default, %
 bare out        of those that nothing covers or shakes, which are left out; %
 covered used    of those in which the mouth is covered all the way, or which are shaken as far, which are used; %
 rmse, bias, r   lip opening of the other used frames against the copy that is not spoiled, mm
+turn            how the head is turned in them, against the same without the constant, degrees
 warnings        how each begins
 """
 
@@ -26,7 +27,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from benchmarks.track_errors import rotation_error
 from personalize.container import probe
 from personalize.pictures import FrameReader
 from personalize.quality import read_reasons
@@ -287,8 +290,8 @@ def write_spoiled(video: Path, out: Path, way: Picture | Spell, crf: int, points
             writer.write(rgb, time)
 
 
-def opening_errors(run: Path, whole: Path, spell: Spell | None) -> list[float]:
-    """[6]: used, bare out, covered used, %; RMSE, bias, mm, and r of the openings against the run `whole`."""
+def errors(run: Path, whole: Path, spell: Spell | None) -> list[float]:
+    """[7]: used, bare out, covered used, %; against the run `whole` RMSE, bias, mm, and r of the openings, and turn."""
     track, right = (read_track(folder / "refine/track.npz") for folder in (run, whole))
     used = read_reasons(run / "refine/quality.csv") == "ok"
     near = np.array([spell.near(time) if spell else 0.0 for time in track.time])
@@ -298,11 +301,14 @@ def opening_errors(run: Path, whole: Path, spell: Spell | None) -> list[float]:
     error = (found - true).astype(np.float64)
     shares = [used.mean(), 1 - used[bare].mean(), used[covered].mean() if covered.any() else np.nan]
     r = float(np.corrcoef(found, true)[0, 1])
+    same = np.searchsorted(right.time, track.time[known] - 1e-3)
+    turns = (Rotation.from_rotvec(turn).as_matrix() for turn in (track.rotation[known], right.rotation[same]))
     return [
         *(100 * float(share) for share in shares),
         float(np.sqrt((error**2).mean())),
         float(error.mean()),
         r,
+        rotation_error(*turns),
     ]
 
 
@@ -311,7 +317,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("videos", type=Path, nargs="+")
     for video in parser.parse_args().videos:
-        columns = ("bare out", 10), ("covered used", 14), ("rmse", 7), ("bias", 7), ("r", 7)
+        columns = (
+            *(("bare out", 10), ("covered used", 14)),
+            *(("rmse", 7), ("bias", 7), ("r", 7), ("turn", 7)),
+        )
         print(
             f"\n{video.name}\n{'':24s}{'used':>6s}", *(f"{name:>{wide}s}" for name, wide in columns), sep=""
         )
@@ -336,13 +345,11 @@ def spoil(video: Path, folder: Path) -> None:
             continue
         if name == WHOLE:
             points = read_landmarks(run / "landmarks/landmarks.npz").points[..., :2]
-        used, out, covered, rmse, bias, r = opening_errors(
-            run, whole, way if isinstance(way, Spell) else None
-        )
+        used, out, covered, rmse, bias, r, turn = errors(run, whole, way if isinstance(way, Spell) else None)
         warnings = [line.removeprefix("warning: ") for line in lines if line.startswith("warning: ")]
         warned = "; ".join(text[:WARNED] for text in warnings if "of usable face" not in text)
         print(
-            f"{name:24s}{used:6.1f}{out:10.1f}{covered:14.1f}{rmse:7.2f}{bias:7.2f}{r:7.3f}  {warned}",
+            f"{name:24s}{used:6.1f}{out:10.1f}{covered:14.1f}{rmse:7.2f}{bias:7.2f}{r:7.3f}{turn:7.2f}  {warned}",
             flush=True,
         )
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.spoiled import (
     LARGER,
@@ -14,9 +15,9 @@ from benchmarks.spoiled import (
     Shaken,
     Small,
     blurred,
+    errors,
     lit,
     noisy,
-    opening_errors,
     ways,
     write_spoiled,
 )
@@ -140,14 +141,21 @@ def test_openings_are_compared_where_nothing_covers_the_mouth(tmp_path: Path) ->
     wrong = np.where(near > 0, gap + 5, gap + 0.5).astype(np.float32)
     reasons = ["occluded" if n == 1 and t < 1.3 else "ok" for n, t in zip(near, time)]
     reasons[3] = "blurred"
-    for name, opening in (("whole", gap), ("spoiled", wrong)):
+    # A head that nods wrongly, by a degree up and down, and is turned by ten throughout.
+    nods = Rotation.from_rotvec(np.radians(np.outer((-1.0) ** np.arange(50), [1.0, 0, 0])))
+    right = Rotation.from_rotvec(track.rotation)
+    turned = (Rotation.from_euler("y", 10, degrees=True) * right * nods).as_rotvec().astype(np.float32)
+    for name, opening, rotation in (("whole", gap, track.rotation), ("spoiled", wrong, turned)):
         (tmp_path / name / "refine").mkdir(parents=True)
-        write_track(tmp_path / name / "refine/track.npz", replace(track, lip_gap_mm=opening))
+        write_track(
+            tmp_path / name / "refine/track.npz", replace(track, lip_gap_mm=opening, rotation=rotation)
+        )
         (tmp_path / name / "refine/quality.csv").write_text("reason\n" + "\n".join(reasons) + "\n")
-    used, bare_out, covered_used, rmse, bias, r = opening_errors(
+    used, bare_out, covered_used, rmse, bias, r, turn = errors(
         tmp_path / "spoiled", tmp_path / "whole", cover
     )
     assert used == pytest.approx(100 * reasons.count("ok") / 50)
     assert bare_out == pytest.approx(100 / (near == 0).sum())
     assert covered_used == pytest.approx(100 * ((near == 1) & (time >= 1.3)).sum() / (near == 1).sum())
     assert (rmse, bias, r) == pytest.approx((0.5, 0.5, 1.0), abs=1e-3)
+    assert turn == pytest.approx(1.0, abs=0.02)
