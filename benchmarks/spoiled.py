@@ -49,11 +49,8 @@ DARK = (28, 25, 25)
 WARNED = 36  # characters
 WIDE = (1920, 1080)  # px
 WORDS = ("EVERY", "two", "TENTHS", "of a second", "ANOTHER", "word", "COMES")
-WORD_S, UNDER, LETTER = (
-    0.4,
-    0.55,
-    0.3,
-)  # how long it stays; under the mouth, and as high, of the distance of the eyes
+WORD_S = 0.4  # how long it stays
+UNDER, LETTER = 0.55, 0.3  # how far under the mouth, and how high, of the distance between the eyes
 WHITE = (255, 255, 255)
 TURN_S, LARGER = 3.0, 1.3  # every other shot of so many s so many times larger
 INSET = 2.6  # times the distance between the eyes: half of what is seen around a small face

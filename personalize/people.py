@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.spatial.distance import squareform
+from scipy.spatial.distance import pdist, squareform
 
 from tracker.face_detector import Face, around, holds, overlaps
 from tracker.landmarker import FaceLandmarker, roi_from_face
@@ -275,27 +275,17 @@ def is_photograph(shapes: Sequence[F32]) -> bool:
     return float(np.quantile(moved, STILL_SHARE)) < STILL
 
 
-@dataclass(frozen=True)
-class Looks:
-    """How n faces look: median landmarks [n, 478 x 3] in one pose, median portraits less their mean, all of norm 1."""
+def differences(faces: Sequence[Tracklet], pose: F64) -> F64:
+    """[n, n] between faces that have samples: of their shapes, and the lack of correlation of their portraits.
 
-    shapes: F64
-    portraits: F64
-
-    @classmethod
-    def of(cls, tracklets: Sequence[Tracklet], pose: F64) -> Looks:
-        """Of tracklets that have samples; `pose`: landmarks [478, 3] to turn theirs onto."""
-        shapes = [np.median(align(np.asarray(t.shapes, np.float64), pose), axis=0).ravel() for t in tracklets]
-        portraits = [np.median(np.asarray(t.portraits, np.float64), axis=0).ravel() for t in tracklets]
-        return cls(
-            *(_of_norm_1(np.stack(rows)) for rows in (shapes, [grey - grey.mean() for grey in portraits]))
-        )
-
-    def distances(self, one: int) -> F64:
-        """[n] of all from one of them: difference of the shapes, and lack of correlation of the portraits."""
-        shape = np.linalg.norm(self.shapes - self.shapes[one], axis=1)
-        alike = np.minimum(self.portraits @ self.portraits[one], 1.0)
-        return shape / SHAPE_SCALE + (1 - alike) / PORTRAIT_SCALE
+    Medians of both; pose: landmarks [478, 3] to turn the shapes onto.
+    """
+    shapes = [np.median(align(np.asarray(t.shapes, np.float64), pose), axis=0).ravel() for t in faces]
+    portraits = [np.median(np.asarray(t.portraits, np.float64), axis=0).ravel() for t in faces]
+    centred = [grey - grey.mean() for grey in portraits]
+    # Of vectors of norm 1 half of the squared distance is what their product lacks of 1.
+    uncorrelated = pdist(_of_norm_1(np.stack(centred)), "sqeuclidean") / 2
+    return squareform(pdist(_of_norm_1(np.stack(shapes))) / SHAPE_SCALE + uncorrelated / PORTRAIT_SCALE)
 
 
 def _of_norm_1(rows: F64) -> F64:
@@ -323,8 +313,7 @@ def _persons(faces: list[Tracklet]) -> list[NDArray[np.int64]]:
     """
     if len(faces) < 2:
         return [np.arange(len(faces))] * len(faces)
-    looks = Looks.of(faces, np.asarray(max(faces, key=lambda t: t.weight).shapes[0], np.float64))
-    apart = np.stack([looks.distances(row) for row in range(len(faces))])
+    apart = differences(faces, np.asarray(max(faces, key=lambda t: t.weight).shapes[0], np.float64))
     first, last = np.array([(face.frames[0], face.frames[-1]) for face in faces]).T
     apart[(first[:, None] <= last) & (first <= last[:, None])] = TOGETHER
     np.fill_diagonal(apart, 0.0)

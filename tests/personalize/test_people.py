@@ -14,9 +14,9 @@ import pytest
 from personalize.people import (
     OTHER_PERSON,
     FaceFollower,
-    Looks,
     Tracklet,
     apart,
+    differences,
     main_person,
     sharpness,
     sureness_of_turns,
@@ -257,7 +257,7 @@ def test_people_are_told_apart_by_the_shape_of_the_face_and_by_how_the_head_look
         return made
 
     faces = one, mixed(one, one, 0.5), mixed(other, one), mixed(one, other), mixed(other, other)
-    _, same, shape, portrait, both = Looks.of(faces, pose).distances(0)
+    _, same, shape, portrait, both = differences(faces, pose)[0]
     assert same < 0.2 and min(shape, portrait) > OTHER_PERSON / 2
     assert both == pytest.approx(shape + portrait, abs=0.1)
 
@@ -280,7 +280,7 @@ def test_a_shot_is_of_the_person_whose_other_shots_it_looks_like() -> None:
 
     mine = [shot(0, 90, 0.0, 0.4), *(shot(100 * k, 30, 0.3 * k) for k in range(1, 5))]
     other = shot(600, 30, 0.0, 1.3)
-    looks = Looks.of([*mine, other], np.asarray(mine[0].shapes[0], np.float64)).distances(0)
+    looks = differences([*mine, other], np.asarray(mine[0].shapes[0], np.float64))[0]
     assert looks[4] > OTHER_PERSON > looks[5] and looks.argmax() == 4
     kept, left = main_person([other, *mine])
     assert {id(t) for t in kept} == {id(t) for t in mine} and left == [other]
