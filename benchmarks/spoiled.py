@@ -8,7 +8,7 @@ used            frames that are used by default, %
 bare out        of those that nothing covers or shakes, which are left out; %
 covered used    of those in which the mouth is covered all the way, or which are shaken as far, which are used; %
 rmse, bias, r   lip opening of the other used frames against the copy that is not spoiled, mm
-turn            how the head is turned in them, against the same without the constant, degrees
+turn            how the head is turned there towards whoever looks at it, against the same without the constant, degrees
 warnings        how each begins
 """
 
@@ -37,7 +37,7 @@ from personalize.run import read_landmarks, read_track
 from personalize.sound import on_video_clock, read_audio
 from personalize.video_writer import VideoWriter
 from tracker.landmark_indices import LEFT_EYE_OUTER, LIPS, POINTS, RIGHT_EYE_OUTER
-from tracker.track import F32, F64
+from tracker.track import F32, F64, Track
 
 U8 = NDArray[np.uint8]
 Picture = Callable[[U8, F32], U8]  # of a picture [H, W, 3] and its landmarks [478, 2] px
@@ -299,14 +299,22 @@ def errors(run: Path, whole: Path, spell: Spell | None) -> list[float]:
     shares = [used.mean(), 1 - used[bare].mean(), used[covered].mean() if covered.any() else np.nan]
     r = float(np.corrcoef(found, true)[0, 1])
     same = np.searchsorted(right.time, track.time[known] - 1e-3)
-    turns = (Rotation.from_rotvec(turn).as_matrix() for turn in (track.rotation[known], right.rotation[same]))
     return [
         *(100 * float(share) for share in shares),
         float(np.sqrt((error**2).mean())),
         float(error.mean()),
         r,
-        rotation_error(*turns),
+        rotation_error(towards_camera(track, known), towards_camera(right, same)),
     ]
+
+
+def towards_camera(track: Track, frames: NDArray[np.integer | np.bool_]) -> F64:
+    """Head rotations [n, 3, 3] of some frames in a camera that looks at where the head is on average.
+
+    In the corner of a wide picture a head that looks into the lens is turned aside for the camera.
+    """
+    ahead = Rotation.align_vectors([[0.0, 0.0, 1.0]], track.translation[frames].mean(0, keepdims=True))[0]
+    return np.asarray((ahead * Rotation.from_rotvec(track.rotation[frames])).as_matrix())
 
 
 def main() -> None:

@@ -141,15 +141,20 @@ def test_openings_are_compared_where_nothing_covers_the_mouth(tmp_path: Path) ->
     wrong = np.where(near > 0, gap + 5, gap + 0.5).astype(np.float32)
     reasons = ["occluded" if n == 1 and t < 1.3 else "ok" for n, t in zip(near, time)]
     reasons[3] = "blurred"
-    # A head that nods wrongly, by a degree up and down, and is turned by ten throughout.
+    # A head that turns by 15 degrees before the lens, and in the corner of the picture, where it nods by one too much.
+    turns = np.outer(np.radians(15) * np.sin(time * 4), [0, 1, 0])
+    whole = replace(track, lip_gap_mm=gap, rotation=turns.astype(np.float32))
     nods = Rotation.from_rotvec(np.radians(np.outer((-1.0) ** np.arange(50), [1.0, 0, 0])))
-    right = Rotation.from_rotvec(track.rotation)
-    turned = (Rotation.from_euler("y", 10, degrees=True) * right * nods).as_rotvec().astype(np.float32)
-    for name, opening, rotation in (("whole", gap, track.rotation), ("spoiled", wrong, turned)):
+    corner = Rotation.from_euler("yx", [20, -12], degrees=True)
+    spoiled = replace(
+        whole,
+        lip_gap_mm=wrong,
+        rotation=(corner * Rotation.from_rotvec(turns) * nods).as_rotvec().astype(np.float32),
+        translation=corner.apply(track.translation).astype(np.float32),
+    )
+    for name, found in (("whole", whole), ("spoiled", spoiled)):
         (tmp_path / name / "refine").mkdir(parents=True)
-        write_track(
-            tmp_path / name / "refine/track.npz", replace(track, lip_gap_mm=opening, rotation=rotation)
-        )
+        write_track(tmp_path / name / "refine/track.npz", found)
         (tmp_path / name / "refine/quality.csv").write_text("reason\n" + "\n".join(reasons) + "\n")
     used, bare_out, covered_used, rmse, bias, r, turn = errors(
         tmp_path / "spoiled", tmp_path / "whole", cover
