@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.enlarged import by_turns
 from benchmarks.track_errors import rotation_error
 from personalize.container import probe
 from personalize.pictures import FrameReader
@@ -52,7 +53,6 @@ WORDS = ("EVERY", "two", "TENTHS", "of a second", "ANOTHER", "word", "COMES")
 WORD_S = 0.4  # how long it stays
 UNDER, LETTER = 0.55, 0.3  # how far under the mouth, and how high, of the distance between the eyes
 WHITE = (255, 255, 255)
-TURN_S, LARGER = 3.0, 1.3  # every other shot of so many s so many times larger
 INSET = 2.6  # times the distance between the eyes: half of what is seen around a small face
 BELOW = 1.3  # of the distance between the eyes: how far under the mouth a cover comes from
 
@@ -181,20 +181,15 @@ class Captioned:
 
 
 class Enlarged:
-    """Every other few seconds larger, about the picture's middle."""
+    """Every other shot larger, about the picture's middle."""
 
     def __init__(self, fps: float) -> None:
-        self._turn, self._shown = round(TURN_S * fps), 0
+        self._fps, self._shown = fps, 0
 
     def __call__(self, rgb: U8, _: F32) -> U8:
         """The picture, or the middle of it."""
-        larger = self._shown // self._turn % 2
         self._shown += 1
-        if not larger:
-            return rgb
-        middle = (np.array(rgb.shape[1::-1]) - 1) / 2
-        warp = np.column_stack([LARGER * np.eye(2), (1 - LARGER) * middle])
-        return np.asarray(cv2.warpAffine(rgb, warp, rgb.shape[1::-1], flags=cv2.INTER_CUBIC), np.uint8)
+        return by_turns(rgb, (self._shown - 1) / self._fps)
 
 
 def _around(rgb: U8, place: F32, wide: float, high: float) -> U8:

@@ -24,7 +24,7 @@ def test_any_stranger_may_be_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[set[str]] = []
     monkeypatch.setattr(tracking, "compile_ahead", lambda head: None)
     monkeypatch.setattr(
-        tracking, "ground_truths", lambda head, chosen, lens: asked.append(chosen) or iter(())
+        tracking, "ground_truths", lambda head, chosen, *options: asked.append(chosen) or iter(())
     )
     monkeypatch.setattr(sys, "argv", ["tracking", "stranger1234"])
     tracking.main()
