@@ -14,14 +14,20 @@ def animate(
     speech: Annotated[Path, typer.Argument(help="Sound or video file with the speech, any voice.")],
     subject: Annotated[Path, typer.Option(help="Run folder, or a checkpoint.safetensors.")],
     out: Annotated[
-        Path | None, typer.Option(help="Output folder; SPEECH's name + .animation if not given.")
+        Path | None,
+        typer.Option(help="Output folder; SPEECH's name + .animation in the working folder if not given."),
     ] = None,
     samples: Annotated[int, typer.Option(min=1, max=100, help="How many different performances.")] = 1,
     guidance: Annotated[
         float | None, typer.Option(min=0, max=2, help="Guidance scale; the checkpoint's own if not given.")
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all samples, which are drawn together.")
+        int,
+        typer.Option(
+            min=0,
+            max=LARGEST_SEED,
+            help="Seed; samples are drawn together, so another --samples changes all.",
+        ),
     ] = 0,
     encoder: Annotated[
         str | None,

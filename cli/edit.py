@@ -9,7 +9,7 @@ import typer
 
 from personalize.settings import LARGEST_SEED
 
-TIMES = "Seconds or shares of the motion: FROM:TO (ends may be left out) or single times, comma-separated."
+TIMES = "Seconds, or percentages of the motion (10%): FROM:TO (ends may be left out) or single times, comma-separated."
 
 
 def edit(
@@ -25,7 +25,8 @@ def edit(
     ] = None,
     keep: Annotated[str, typer.Option(metavar="TIMES", help=f"Frames to keep. {TIMES}")] = "",
     keyframes: Annotated[
-        str, typer.Option(metavar="TIMES", help="Frames to go through, in the same form.")
+        str,
+        typer.Option(metavar="TIMES", help="Frames that the result must pass through; times as for --keep."),
     ] = "",
     source: Annotated[
         Path | None, typer.Option("--from", help="Another motion.npz, from which the keyframes are taken.")
@@ -43,17 +44,24 @@ def edit(
         bool, typer.Option("--unconditional", help="Do not listen to the audio, only play it.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(help="Output folder; MOTION's name + .edit if not given.")
+        Path | None,
+        typer.Option(help="Output folder; MOTION's name + .edit in the working folder if not given."),
     ] = None,
     samples: Annotated[int, typer.Option(min=1, max=100, help="How many different edits.")] = 1,
     guidance: Annotated[
         float | None, typer.Option(min=0, max=2, help="Guidance scale; the checkpoint's own if not given.")
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all samples, which are drawn together.")
+        int,
+        typer.Option(
+            min=0,
+            max=LARGEST_SEED,
+            help="Seed; samples are drawn together, so another --samples changes all.",
+        ),
     ] = 0,
     rule: Annotated[
-        Literal["posterior", "renoise", "ddim"], typer.Option(help="How a denoising step goes back.")
+        Literal["posterior", "renoise", "ddim"],
+        typer.Option(help="Sampling rule of the diffusion, see docs/method.md."),
     ] = "posterior",
     encoder: Annotated[
         str | None,
@@ -87,5 +95,5 @@ def _names(text: str, option: str) -> tuple[str, ...]:
 
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if text and not names:
-        raise UserError(f"{option} {text!r}: names no part of the face")
+        raise UserError(f"{option} {text!r}: names no part of the face; give names such as lips,eyelids")
     return names

@@ -46,9 +46,14 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     help="Turn a talking-head video into a personal, editable 3D facial animation model.",
-    epilog="""Examples:  personalize talk.mp4   |   personalize animate speech.wav --subject talk.personalize   |
-    personalize edit speech.animation/motion.npz --audio speech.wav --keep :1.5,8.2: --subject talk.personalize   |
-    personalize demo.   A video whose name is a command's is given as ./name.""",
+    epilog="""\b
+Examples:
+  personalize talk.mp4    (short for personalize run talk.mp4; its options: personalize run --help)
+  personalize animate speech.wav --subject talk.personalize
+  personalize edit speech.animation/motion.npz --audio speech.wav --keep :1.5,8.2: --subject talk.personalize
+  personalize demo
+
+A video whose name is a command's is given as ./name.""",
 )
 for name, command in COMMANDS.items():
     app.command(name)(command)
@@ -117,7 +122,7 @@ def main() -> None:
             code = INPUT_ERROR
         elif isinstance(error, OSError) and error.errno in CLOSED and error.filename:
             typer.echo(
-                f"personalize: {error.filename}: cannot be read or written ({error.strerror}); mind its "
+                f"personalize: {error.filename}: cannot be read or written ({error.strerror}); check its "
                 "permissions and its name, or choose another --out",
                 err=True,
             )

@@ -16,7 +16,8 @@ MOST_DISTORTION = 10.0  # that a lens has; also no infinity
 def run(
     video: Annotated[Path, typer.Argument(help="Video of one person talking: anything FFmpeg reads.")],
     out: Annotated[
-        Path | None, typer.Option(help="Run folder; VIDEO's name + .personalize if not given.")
+        Path | None,
+        typer.Option(help="Run folder; VIDEO's name + .personalize in the working folder if not given."),
     ] = None,
     iterations: Annotated[int, typer.Option(min=1, help="Fine-tuning steps.")] = Settings.iterations,
     seed: Annotated[
@@ -37,7 +38,7 @@ def run(
         str | None,
         typer.Option(help="Folder or hub name of the speech encoder that --base was trained with."),
     ] = None,
-    device: Annotated[str, typer.Option(help="That fine-tuning runs on: cpu or cuda.")] = Settings.device,
+    device: Annotated[str, typer.Option(help="What fine-tuning runs on: cpu or cuda.")] = Settings.device,
     head: Annotated[
         Path | None, typer.Option(help="FLAME pickle to track with; the embedded head if not given.")
     ] = None,
@@ -60,11 +61,24 @@ def run(
     min_confidence: Annotated[
         float, typer.Option(min=0, max=1, help="Leave frames out that are tracked with less confidence.")
     ] = Settings.min_confidence,
-    until: Annotated[str | None, typer.Option(metavar="STAGE", help="Stop after this stage.")] = None,
-    from_: Annotated[
-        str | None, typer.Option("--from", metavar="STAGE", help="Make again from here on.")
+    until: Annotated[
+        str | None,
+        typer.Option(
+            metavar="STAGE",
+            help="Stop after this stage: ingest, landmarks, camera, track, refine, judge, overlay, registration, "
+            "finetune, evaluate.",
+        ),
     ] = None,
-    force: Annotated[str | None, typer.Option(metavar="STAGE", help="Make this stage again.")] = None,
+    from_: Annotated[
+        str | None,
+        typer.Option("--from", metavar="STAGE", help="Make this stage and all after it again."),
+    ] = None,
+    force: Annotated[
+        str | None,
+        typer.Option(
+            metavar="STAGE", help="Make this stage again, and what follows only if it came out otherwise."
+        ),
+    ] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Track the face in VIDEO, fine-tune the model on it, and report. Run it again to continue or to change."""

@@ -284,7 +284,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     if not path.is_file():
         raise ModelError(f"there is no file {path}")
     if not os.access(path, os.R_OK):
-        raise ModelError(f"{path} may not be read; mind its permissions")
+        raise ModelError(f"{path} may not be read; check its permissions")
     try:
         with safe_open(path, framework="pt") as stream:
             return {name: stream.get_tensor(name) for name in stream.keys()}, stream.metadata() or {}  # noqa: SIM118

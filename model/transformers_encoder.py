@@ -206,7 +206,7 @@ def find_folder(place: str) -> Path:
     except (OSError, ValueError) as error:
         reason = one_line(error)
         raise ModelError(
-            f"{place}: neither a folder nor a model that the hub gives ({reason}); see the spelling, go online, "
+            f"{place}: neither a folder nor a model that the hub gives ({reason}); check the spelling, go online, "
             "or give a model's folder"
         ) from error
     return folder

@@ -132,7 +132,7 @@ def output_places(folder: Path, samples: int, inputs: Iterable[Path | None]) -> 
             raise UserError(f"{place}: cannot be written; choose another --out")
         for name in (MOTION_NAME, FILM_NAME):
             if os.path.realpath(place / name) in read:
-                raise UserError(f"{place}: holds {name} that is read here; choose another --out")
+                raise UserError(f"{place}: holds the {name} that this command reads; choose another --out")
     return places
 
 

@@ -77,7 +77,9 @@ def check_parts(data: Vocaset, report: Reporter) -> None:
     for part, names in (("training", TRAIN), ("validation", VAL)):
         found = there(data, names)
         if not found:
-            raise UserError(f"{data.folder} has none of the {part} subjects {', '.join(names)}")
+            raise UserError(
+                f"{data.folder} has none of the {part} subjects {', '.join(names)}; get the whole data"
+            )
         if len(found) < len(names):
             missing = [name for name in names if name not in found]
             report.warn(f"{data.folder} lacks the {part} subjects {', '.join(missing)}")
@@ -89,10 +91,12 @@ def tested(data: Vocaset, adapt: list[str]) -> list[str]:
     """The test subjects to adapt to; UserError where one is none, or has no sentences for a part."""
     for name in adapt:
         if name not in TEST:
-            raise UserError(f"{name} is no test subject of VOCAset; --adapt takes {' or '.join(TEST)}")
+            raise UserError(f"{name} is not a test subject of VOCAset; --adapt takes {' or '.join(TEST)}")
     chosen = adapt or there(data, TEST)
     for name in chosen:
         numbers = set(data.sentences(name))
         if not all(numbers & set(part) for part in (ADAPT_TRAIN, ADAPT_VAL, UNSHARED)):
-            raise UserError(f"{data.folder}: {name} needs some of sentences 1-18, of 19-20, and of 21-40")
+            raise UserError(
+                f"{data.folder}: {name} needs some of sentences 1-18, of 19-20, and of 21-40; get the whole data"
+            )
     return chosen

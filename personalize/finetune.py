@@ -16,6 +16,8 @@ from personalize.run import RunFolder, tool_version
 from personalize.settings import Settings
 from personalize.subject_data import base_path, load_base, load_subject_data
 
+PARTS = {"train": "training", "val": "validation", "test": "test"}
+
 
 def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Reporter) -> None:
     """Write checkpoint.safetensors, log.csv, guidance.json and tensorboard/ into `folder`, continuing what is there.
@@ -24,11 +26,11 @@ def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     """
     base = load_base(settings)
     data = load_subject_data(run, style=len(base.styles), encoder=load_encoder(settings.encoder))
-    for part in ("train", "val", "test"):
+    for part in PARTS:
         if not data.parts[part]:
             raise UserError(
-                f"{run.video}: no second of tracked face in the {part} part of the clip; "
-                "look at overlay.mp4, and film a longer clip"
+                f"{run.video}: nowhere in the {PARTS[part]} part of the clip (times: ingest/split.json) is the face in "
+                "use for a whole second; look at overlay.mp4 for why, and film a longer clip"
             )
     provenance = {
         "tool": "personalize",

@@ -88,7 +88,7 @@ def _files(settings: Settings) -> tuple[Path, Path]:
     assert settings.head is not None
     path = Path(settings.head)
     if not path.is_file():
-        raise UserError(f"--head: there is no file {path}; give a FLAME model, as flame2023.pkl")
+        raise UserError(f"--head: there is no file {path}; give a FLAME model, such as flame2023.pkl")
     if settings.head_embedding is not None:
         return path, Path(settings.head_embedding)
     for name in EMBEDDINGS:

@@ -68,13 +68,24 @@ MAX_UNSEEN_S = 0.3  # a face is taken to be there when the detector misses it fo
 DESCRIPTIONS = {
     "no_face": "no face is seen",
     "cut": "cuts and shots too short to track",
-    "other_person": "another person's face or a photograph's, or something covers it",
+    "other_person": "another person's face or a photograph's, or one covered so that it looks like another's",
     "too_small": "the face is too small",
     "too_dark": "the face is too dark",
     "too_bright": "the face is overexposed",
     "blurred": "the face is blurred",
     "corrupt": "damaged in the file",
     "duplicate": "the picture before is repeated",
+}
+REMEDIES = {
+    "no_face": "keep the face in the picture, turned to the camera",
+    "cut": "longer shots would be used",
+    "other_person": "film one person, or crop the video to one",
+    "too_small": "film closer",
+    "too_dark": "film with more light",
+    "too_bright": "film with less light or exposure",
+    "blurred": "film in focus, with more light",
+    "corrupt": "copy or export the file again",
+    "duplicate": "where pictures stand still, record or export the video again",
 }
 
 
@@ -103,12 +114,15 @@ def ingest_video(path: Path | str, progress: Progress = None) -> Ingested:
         raise UserError(_too_little(media, frames, seconds))
     if seconds < GOOD_USABLE_S:
         warnings.insert(
-            0, f"only {seconds:.1f} s of usable face: results improve up to about 100 s; 30 s are acceptable"
+            0,
+            f"only {seconds:.1f} s of usable face: film more; 30 s are acceptable, results improve up to about 100 s",
         )
     end = float(frames.time[-1] + np.median(np.diff(frames.time)))
     sound = on_video_clock(*audio, end)
     if not sound.any():
-        raise UserError(f"{media.path}: the sound lies before or behind all pictures; export the video again")
+        raise UserError(
+            f"{media.path}: all the sound lies before the first picture or after the last; export the video again"
+        )
     warnings += _without_sound(*audio, end)
     return Ingested(media, frames, sound, make_split(frames), warnings)
 
@@ -130,8 +144,8 @@ def _without_sound(samples: F32, start: float, end: float) -> list[str]:
     if known[0] <= MOST_SILENT_S and known[1] >= end - MOST_SILENT_S:
         return []
     return [
-        f"there is sound from {max(known[0], 0):.1f} to {min(known[1], end):.1f} s of {end:.1f} s: the rest counts as "
-        "silence, and how lips move there as silent"
+        f"there is sound only from {max(known[0], 0):.1f} to {min(known[1], end):.1f} s of {end:.1f} s: lips that move "
+        "outside of that are learned as silent; cut the video to it, or export it again with all its sound"
     ]
 
 
@@ -270,7 +284,7 @@ def _form(media: MediaInfo, reader: FrameReader, total: int) -> list[str]:
     if not np.isnan(reader.resized_s):
         texts.append(
             f"the size of the pictures changes at {reader.resized_s:.1f} s; all are taken at the first one's, "
-            f"{media.width}x{media.height} px: if most are larger, give the part behind"
+            f"{media.width}x{media.height} px: if most of the later ones are larger, give only the part after that"
         )
     if reader.interlaced > MOST_INTERLACED * total:
         texts.append(
@@ -307,9 +321,18 @@ def _lost_in_file(media: MediaInfo, time: F64) -> list[str]:
     gaps = np.flatnonzero(np.diff(time) > MAX_GAP_S)
     if len(gaps):
         seconds, first = float(np.diff(time)[gaps].sum()), float(time[gaps[0]])
-        texts.append(f"{seconds:.1f} s without pictures in {len(gaps)} gaps, the first at {first:.1f} s")
+        where = (
+            f"{len(gaps)} gaps, the first at {first:.1f} s" if len(gaps) > 1 else f"a gap at {first:.1f} s"
+        )
+        texts.append(
+            f"{seconds:.1f} s without pictures, in {where}: each counts as a cut; export the video again, or record it "
+            "without dropping pictures"
+        )
     if media.duration_s - time[-1] > 1.0:
-        texts.append(f"the file breaks off at {time[-1]:.1f} s of {media.duration_s:.1f} s")
+        texts.append(
+            f"the file breaks off at {time[-1]:.1f} s of {media.duration_s:.1f} s; copy or export it again if you need "
+            "the rest"
+        )
     return texts
 
 
@@ -320,12 +343,13 @@ def _warnings(frames: Frames, eyes: F32, light: F32, burnt: F32, steps: float) -
     for number, name in enumerate(REASONS[1:], 1):
         share = float((frames.reason == number).mean())
         if share > 0.05 or (share > 0 and name == "corrupt"):
-            texts.append(f"{share:.1%} of {total} frames left out: {DESCRIPTIONS[name]}")
+            texts.append(f"{share:.1%} of {total} frames left out: {DESCRIPTIONS[name]}; {REMEDIES[name]}")
     if frames.usable.any():
         size, level, lost = (float(np.median(measure[frames.usable])) for measure in (eyes, light, burnt))
         if size < GOOD_EYES_PX:
             texts.append(
-                f"the face is small ({size:.0f} px between the eyes): lips will be measured coarsely"
+                f"the face is small ({size:.0f} px between the eyes): lips will be measured coarsely; film closer, or "
+                "in a higher resolution"
             )
         if 2 ** (steps / 6) > COARSE * size:
             texts.append(

@@ -99,7 +99,7 @@ class FrameReader(Iterator[tuple[float, U8]]):
         if frame.colorspace in _UNKNOWN_COLOURS:
             name = _UNKNOWN_COLOURS[frame.colorspace]
             raise UserError(
-                f"{self._path}: its colours are {name}, which cannot be read; export it as usual video"
+                f"{self._path}: its colours are {name}, which cannot be read; export it as ordinary 8-bit H.264"
             )
         if frame.colorspace == _UNSPECIFIED_COLOUR:
             # HD that does not name its colours is BT.709 by convention; FFmpeg would take BT.601.

@@ -70,21 +70,21 @@ def lip_warnings(refined: Refined) -> list[str]:
     texts = []
     if refined.like_lips > LIKE_LIPS:
         texts.append(
-            f"what is between the lips hardly differs from them ({refined.like_lips:.0%} of it looks like lips): "
-            "openings may be measured half a millimetre to a millimetre off; film in better light, sharper, or "
-            "compressed less"
+            f"the inside of the mouth hardly differs in colour from the lips ({refined.like_lips:.0%} of it looks like "
+            "them): lip openings may be measured half a millimetre to a millimetre off; film in better light, sharper, "
+            "or compressed less"
         )
     if refined.fineness < FINE:
         texts.append(
-            "the face is out of focus, or its details are lost otherwise: openings may be measured one or two "
+            "the face is out of focus, or its details are lost otherwise: lip openings may be measured one or two "
             "millimetres too wide; focus on the face, clean the lens, film closer"
         )
     seen = refined.track.valid
     above = float(np.median(from_above_deg(refined.track)[seen])) if seen.any() else 0.0
     if above > FROM_ABOVE_DEG and np.isfinite(refined.fineness):
         texts.append(
-            f"the face is filmed from above, by some {above:.0f} degrees: openings may be measured a tenth to a third "
-            "too narrow; film from the height of the eyes or from below"
+            f"the face is filmed from above, by some {above:.0f} degrees: lip openings may be measured a tenth to a "
+            "third too narrow; film from the height of the eyes or from below"
         )
     return texts
 
@@ -97,7 +97,8 @@ def cover_warnings(reasons: NDArray[np.str_]) -> list[str]:
         return []
     return [
         f"something covers mouth, cheek or eye in {covered:.0%} of the frames that show the face (a hand, a "
-        "microphone, a mask): they are left out, and in others it may hide a part of the mouth; film the face free"
+        "microphone, a mask): these are left out, and in others it may still hide part of the mouth; film the face "
+        "uncovered"
     ]
 
 

@@ -31,7 +31,7 @@ def kept_share(
     for name in keep + remake:
         if name not in checkpoint.regions:
             known = ", ".join(sorted(checkpoint.regions))
-            raise UserError(f"{name!r} is no region of this checkpoint; it has {known}")
+            raise UserError(f"{name!r} is not a region of this checkpoint; choose from {known}")
     named = np.unique(np.concatenate([checkpoint.regions[name] for name in keep + remake]))
     near = _nearness(checkpoint.template, checkpoint.faces, named, blend_m)
     return near if keep else 1 - near

@@ -78,8 +78,8 @@ def register_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
     if not used.any():
         ((reason, _),) = Counter(reasons.tolist()).most_common(1)
         raise UserError(
-            f"{run.video}: no frame is tracked with a confidence of {settings.min_confidence}, mostly for {reason!r}; "
-            f"look at {run.path / 'overlay.mp4'}, and give a better video or a lower --min-confidence"
+            f"{run.video}: no frame is in use, mostly for {reason!r} (see docs/run-folder.md); look at "
+            f"{run.path / 'overlay.mp4'}, and give a lower --min-confidence if the mesh lies well, else a better video"
         )
     track = dataclasses.replace(track, valid=used)
     base = Checkpoint.load(base_path(settings))

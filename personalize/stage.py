@@ -153,7 +153,8 @@ def check_names(stages: Sequence[Stage], first: str | None, until: str | None, f
     for option, value in (("--from", first), ("--force", force)):
         if value is not None and until is not None and names.index(value) > names.index(until):
             raise UserError(
-                f"{option} {value}: this stage comes after --until {until}, and would not be made"
+                f"{option} {value}: this stage comes after --until {until}, and would not be made; leave one of "
+                "the two out, or name a later --until"
             )
 
 

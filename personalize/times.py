@@ -44,7 +44,7 @@ def _frame(text: str, motion: Motion, option: str, lowest: int, highest: int) ->
         number = math.nan
     if not math.isfinite(number):
         raise UserError(
-            f"{option}: {text!r} is no time; write seconds or shares, e.g. 0:1.5,8.2: or :10%,90%:"
+            f"{option}: {text!r} is not a time; write seconds or shares, e.g. 0:1.5,8.2: or :10%,90%:"
         )
     length_s = len(motion.valid) / motion.fps
     after_start = number / 100 * length_s if text.endswith("%") else number - motion.start_s

@@ -65,7 +65,7 @@ def read_tracked(folder: Path, head: HeadModel) -> TrackedFace:
             "--tracked holds FLAME's parameters; give the FLAME file it was tracked with by --head"
         )
     if not folder.is_dir():
-        raise UserError(f"{folder}: there is no such folder")
+        raise UserError(f"{folder}: there is no such folder; give the one that the tracker wrote")
     frames = sorted((*folder.glob("*.frame"), *folder.glob("checkpoint/*.frame")), key=lambda path: path.stem)
     if frames:
         return _metrical(frames, head)
@@ -75,7 +75,8 @@ def read_tracked(folder: Path, head: HeadModel) -> TrackedFace:
     if archives:
         return _vhap(max(archives)[1], head)
     raise UserError(
-        f"{folder}: holds neither metrical-tracker's checkpoint/*.frame nor VHAP's tracked_flame_params_*.npz"
+        f"{folder}: holds neither metrical-tracker's checkpoint/*.frame nor VHAP's tracked_flame_params_*.npz; "
+        "give the folder that docs/heads.md describes"
     )
 
 

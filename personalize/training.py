@@ -164,7 +164,9 @@ def read_faces(mesh: Path, vertex_count: int) -> NDArray[np.int32]:
         faces = np.asarray(loaded.faces, np.int32).reshape(-1, 3)
         found = len(loaded.vertices)
     except Exception as error:  # whatever a parser of foreign text meets in a broken file
-        raise UserError(f"{mesh} is not a readable mesh ({' '.join(str(error).split())[:120]})") from error
+        raise UserError(
+            f"{mesh} is not a readable mesh ({' '.join(str(error).split())[:120]}); get it again"
+        ) from error
     if found != vertex_count or len(faces) == 0 or not 0 <= faces.min() <= faces.max() < found:
         raise UserError(
             f"{mesh} has {found} vertices and {len(faces)} triangles, and the data {vertex_count} vertices:"
@@ -254,9 +256,9 @@ def _work_folder(out: Path, key: str, files: Iterable[Path], first: bool) -> Pat
     if out.is_dir():
         raise UserError(f"{out}: a folder; give --out the name of a file, as {out / 'model.safetensors'}")
     if out.resolve() in {path.resolve() for path in files}:
-        raise UserError(f"{out}: is learned from; choose another --out")
+        raise UserError(f"{out}: is one of the files to learn from; choose another --out")
     if out.is_file() and not is_checkpoint(out):
-        raise UserError(f"{out}: is there already, and no checkpoint; choose another --out")
+        raise UserError(f"{out}: exists and is not a checkpoint; choose another --out")
     work = out.with_name(f"{out.name}.work")
     key_file = work / "key"
     try:

@@ -182,7 +182,7 @@ def open_vocaset(folder: Path) -> Vocaset:
         if all((folder / name).exists() for name in files):
             return layout(folder)
     raise UserError(
-        f"{folder} is no VOCAset: it needs {', '.join(TRAINING_FILES)} (VOCA's training files),"
+        f"{folder} is not VOCAset: it needs {', '.join(TRAINING_FILES)} (VOCA's training files),"
         f" or {', '.join(SEQUENCE_FILES)} (one file a sentence)"
     )
 

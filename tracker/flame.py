@@ -88,7 +88,7 @@ def flame_head(
         signed=True,
     )
     if not len(skin_triangles(head)):
-        raise TrackError("no FLAME model: its masks leave no face of bare skin")
+        raise TrackError("not a FLAME model: its masks leave no face of bare skin")
     return head
 
 
@@ -96,7 +96,7 @@ def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
     """The arrays that make the head, in double precision and of the shapes that fit each other."""
     missing = [key for key in ARRAYS if key not in arrays]
     if missing:
-        raise TrackError(f"no FLAME model: {', '.join(missing)} is missing")
+        raise TrackError(f"not a FLAME model: {', '.join(missing)} is missing")
     # Shapes first: what does not fit is not made larger by being made double.
     shapes = {key: np.shape(arrays[key]) or (1,) for key in ARRAYS}
     vertices, triangles = shapes["v_template"][0], shapes["f"][0]
@@ -116,25 +116,25 @@ def _checked(arrays: Arrays) -> dict[str, NDArray[np.float64]]:
             try:
                 checked[key] = np.asarray(arrays[key], np.float64)
             except (TypeError, ValueError, OverflowError) as error:
-                raise TrackError(f"no FLAME model: {key} holds no numbers ({error})") from error
+                raise TrackError(f"not a FLAME model: {key} holds no numbers ({error})") from error
             if key == "kintree_table":
                 # The root's parent is 2^32 - 1.
                 checked[key] = np.where(checked[key] >= len(PARENTS), -1, checked[key])
             fits = bool((np.abs(checked[key]) < LARGEST).all())  # NaN is not below it
         if not fits:
             raise TrackError(
-                f"no FLAME model: {key} is {shapes[key]}, numbers below {LARGEST:.0e} of {shape} needed"
+                f"not a FLAME model: {key} is {shapes[key]}, numbers below {LARGEST:.0e} of {shape} needed"
             )
     if not vertices or not triangles:
-        raise TrackError(f"no FLAME model: it has {vertices} vertices and {triangles} faces")
+        raise TrackError(f"not a FLAME model: it has {vertices} vertices and {triangles} faces")
     if modes <= IDENTITIES:
         raise TrackError(
-            f"no FLAME model with expressions: shapedirs holds {modes} shapes, of which {IDENTITIES} are the identity's"
+            f"not a FLAME model with expressions: of the {modes} shapes in shapedirs {IDENTITIES} are the identity's"
         )
     if tuple(checked["kintree_table"][0]) != PARENTS:
-        raise TrackError("no FLAME model: its joints are not root, neck, jaw, left and right eye")
+        raise TrackError("not a FLAME model: its joints are not root, neck, jaw, left and right eye")
     if checked["f"].min() < 0 or checked["f"].max() >= vertices:
-        raise TrackError(f"no FLAME model: its faces name vertices above {vertices}")
+        raise TrackError(f"not a FLAME model: its faces name vertices above {vertices}")
     return checked
 
 
@@ -158,7 +158,7 @@ def _check_area(points: EmbeddedPoints, template: NDArray[np.float64], faces: ND
     corners = template[faces[points.triangles]]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     if not (area > LEAST_AREA_M2).all():
-        raise TrackError("no FLAME model: a face under a landmark has no area")
+        raise TrackError("not a FLAME model: a face under a landmark has no area")
 
 
 def _check_rigid(

@@ -15,9 +15,9 @@ from tracker.scene import U8, Scene
 
 MODES = {
     "shaded": "the fitted surface in clay",
-    "wireframe": "its edges, with the lines where the lips and the lids meet, and the irises",
+    "wireframe": "the fitted mesh's edges, with the lines where the lips and the lids meet, and the irises",
     "albedo": "the face re-rendered: the subject's colours in the light of each frame",
-    "error": "how far that is from the picture, in grey levels",
+    "error": "how far the re-rendered face is from the picture, in grey levels",
     "landmarks": "detected points in green, each joined to its fitted one in red",
 }
 NEEDS_ALBEDO = ("albedo", "error")

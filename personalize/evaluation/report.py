@@ -23,13 +23,13 @@ from tracker.overlay import MODES
 
 # Metric of metrics.json -> name and meaning in the table.
 COLUMNS = {
-    "lip_sync": "lip opening after time warping, mm",
+    "lip_sync": "error of the lip opening after time warping, mm",
     "lip_max": "largest lip-vertex error of a frame, mm",
     "l2_lip": "mean lip-vertex error, mm",
     "l2_face": "mean face-vertex error, mm",
     "lip_gap_r": "correlation of the lip opening (higher is better)",
     "closure": "share of lip closures reached (higher is better)",
-    "div_e": "difference between samples, mm",
+    "div_e": "difference between samples, mm (higher: more varied)",
 }
 LISTED = 12  # spans left out that the report tells of
 
@@ -84,7 +84,7 @@ def _cards(systems: dict[str, dict[str, float]], duration: float, tracked: float
         {"value": f"{duration:.0f} s", "label": "of video"},
         {"value": f"{tracked:.0%}", "label": "of frames used"},
         {"value": f"{ours['lip_sync']:.2f} mm", "label": f"lip_sync (base {base['lip_sync']:.2f})"},
-        {"value": f"{ours['l2_lip']:.2f} mm", "label": f"lip error (base {base['l2_lip']:.2f})"},
+        {"value": f"{ours['l2_lip']:.2f} mm", "label": f"l2_lip (base {base['l2_lip']:.2f})"},
         {"value": f"{ours['lip_gap_r']:.2f}", "label": "correlation of lip opening"},
     ]
 
@@ -140,7 +140,11 @@ def _sound_offset(registration: dict[str, Any]) -> str:
         done = "corrected"
     else:
         done = f"{'small' if 0 < abs(found_s) <= SMALLEST_S else 'not sure'}, left as it is"  # 0: nothing was found
-    return f"{found_s * 1000:+.0f} ms ({done})"
+    return (
+        f"{abs(found_s) * 1000:.0f} ms {'late' if found_s > 0 else 'early'} ({done})"
+        if found_s
+        else f"0 ms ({done})"
+    )
 
 
 def _data_url(path: Path, kind: str) -> str:

@@ -13,6 +13,7 @@ import pytest
 
 import cli.main
 from personalize.errors import UserError
+from personalize.pipeline import STAGES
 from personalize.subject_data import BASE_CHECKPOINT
 from tests.personalize.video_factory import corner_picture, write_video
 
@@ -37,7 +38,9 @@ def test_version_and_help(tmp_path: Path) -> None:
     shown = personalize("--help", cwd=tmp_path)
     assert shown.returncode == 0
     assert all(command in shown.stdout for command in ("animate", "edit", "demo"))
-    assert "--iterations" in personalize("run", "--help", cwd=tmp_path).stdout
+    options = personalize("run", "--help", cwd=tmp_path).stdout
+    assert "--iterations" in options
+    assert ", ".join(stage.name for stage in STAGES) in " ".join(options.split())
 
 
 def test_the_command_is_there_before_what_takes_seconds_to_import(tmp_path: Path) -> None:

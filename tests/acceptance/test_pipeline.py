@@ -132,7 +132,7 @@ def test_the_report_tells_what_ails_the_clip(finished: Path, tmp_path: Path) -> 
     refined = read_refined(out / "photometric")
     write_refined(out / "photometric", replace(refined, like_lips=0.4))
     texts = _warnings(RunFolder.open(out), media)
-    assert len(texts) == len(media["warnings"]) + 1 and "40% of it looks like lips" in texts[-1]
+    assert len(texts) == len(media["warnings"]) + 1 and "40% of it looks like them" in texts[-1]
     quality = out / "refine/quality.csv"
     quality.write_text(quality.read_text().replace(",ok\n", ",occluded\n"))
     covered = _warnings(RunFolder.open(out), media)

@@ -166,7 +166,7 @@ def test_mistakes_get_one_line_and_write_nothing(
 
     refused("--keep: 9 is outside the motion", keep="9:")
     refused("--keyframes: 0.1 is outside", keyframes="0.1")
-    refused("'nose' is no region", keep_regions=("nose",))
+    refused("'nose' is not a region", keep_regions=("nose",))
     refused("one of them", keep_regions=("lips",), remake=("eyes",))
     refused(r"short.wav: its sound ends at 1.00 s, the motion at 1.97 s", audio=short)
     refused("silent.wav: there is no sound", audio=silent)
@@ -199,9 +199,11 @@ def test_nothing_that_is_read_is_written_over(
         {"motion": motion, "audio": speech, "keyframes": "0.9", "source": earlier},
         {"motion": motion, "audio": film},
     ):
-        with pytest.raises(UserError, match=r"out/1: holds .* that is read here; choose another --out"):
+        with pytest.raises(
+            UserError, match=r"out/1: holds the .* that this command reads; choose another --out"
+        ):
             run(out=tmp_path / "out", samples=2, **read)  # type: ignore[arg-type]
-    with pytest.raises(UserError, match=r"holds motion\.npz that is read here"):
+    with pytest.raises(UserError, match=r"holds the motion\.npz that this command reads"):
         run(earlier, speech, earlier.parent)
     with pytest.raises(UserError, match="cannot be written; choose another --out"):
         run(motion, speech, speech / "out")

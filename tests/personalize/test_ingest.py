@@ -16,7 +16,9 @@ import pytest
 from personalize.container import MediaInfo, probe
 from personalize.errors import UserError
 from personalize.ingest import (
+    DESCRIPTIONS,
     MIN_USABLE_S,
+    REMEDIES,
     _check_upright,
     _form,
     _lost_in_file,
@@ -30,6 +32,7 @@ from personalize.people import (
 )
 from personalize.pictures import FrameReader
 from personalize.shots import (
+    REASONS,
     Frames,
     find_shots,
     repeated,
@@ -202,7 +205,7 @@ def test_sound_beside_all_pictures_is_refused(tmp_path: Path, monkeypatch: pytes
     )
     frames = frames_of(np.arange(300) / 25, np.ones(300, bool))
     monkeypatch.setattr("personalize.ingest.find_usable", lambda media, progress: (frames, []))
-    with pytest.raises(UserError, match="before or behind all pictures"):
+    with pytest.raises(UserError, match="before the first picture or after the last"):
         ingest_video(path)
 
 
@@ -273,7 +276,9 @@ def test_a_matroska_file_that_begins_late_breaks_not_off(tmp_path: Path) -> None
 def test_what_the_file_lost_is_said(tmp_path: Path) -> None:
     path = write_video(tmp_path / "gap.mkv", moving(20), [i / 25 + (i >= 10) for i in range(20)])
     _, warnings = find_usable(probe(path))
-    assert any("1.0 s without pictures in 1 gaps, the first at 0.4 s" in text for text in warnings)
+    assert any(
+        "1.0 s without pictures, in a gap at 0.4 s: each counts as a cut; export" in text for text in warnings
+    )
 
 
 def seen_as(faces: list[Tracklet], time: np.ndarray, **marks: np.ndarray) -> _Seen:
@@ -328,6 +333,7 @@ def test_every_frame_is_left_out_for_its_reason(monkeypatch: pytest.MonkeyPatch)
     )
     assert any("2.0% of 100 frames left out: damaged" in text for text in warnings)  # however few
     assert any("20.0% of 100 frames left out: another person" in text for text in warnings)
+    assert set(DESCRIPTIONS) == set(REMEDIES) == set(REASONS[1:])
     assert not any("repeated" in text for text in warnings)
 
 
@@ -376,7 +382,9 @@ def test_how_much_usable_face_there_is_is_told(
 def test_a_file_that_breaks_off_is_told() -> None:
     media = cast(MediaInfo, SimpleNamespace(duration_s=5.0))
     assert _lost_in_file(media, np.arange(101) / 25) == []
-    assert _lost_in_file(media, np.arange(76) / 25) == ["the file breaks off at 3.0 s of 5.0 s"]
+    assert _lost_in_file(media, np.arange(76) / 25) == [
+        "the file breaks off at 3.0 s of 5.0 s; copy or export it again if you need the rest"
+    ]
 
 
 SHARED = Path(os.environ.get("PERSONALIZE_SHARED", Path(__file__).parents[3] / "shared")) / "data/videos"

@@ -70,7 +70,7 @@ def test_another_threshold_judges_again_and_makes_nothing_else():
     [
         (np.nan, np.nan, []),
         (0.16, 0.09, []),
-        (0.31, 0.2, ["31% of it looks like lips"]),
+        (0.31, 0.2, ["31% of it looks like them"]),
         (0.7, 0.07, ["70% of it", "out of focus"]),
     ],
 )

@@ -61,7 +61,7 @@ def test_a_time_in_the_last_half_frame_is_told_where_the_last_one_lies() -> None
 
 @pytest.mark.parametrize("text", ["a", "1:b", "nan", "inf:", "1,,2", "1:2:3", "%"])
 def test_what_is_no_time_is_refused(text: str) -> None:
-    with pytest.raises(UserError, match="is no time"):
+    with pytest.raises(UserError, match="is not a time"):
         frames_at(text, motion(), "--keep")
 
 

@@ -197,7 +197,10 @@ def test_what_is_learned_from_and_what_is_no_checkpoint_is_not_written_over(
     folder, note = write_motions(fake, tmp_path / "motions"), tmp_path / "note.txt"
     note.write_text("mine")
     before = {path: path.read_bytes() for path in (*folder.iterdir(), note)}
-    for out, says in ((folder / "bob.npz", "is learned from"), (note, "is there already, and no checkpoint")):
+    for out, says in (
+        (folder / "bob.npz", "is one of the files to learn from"),
+        (note, "exists and is not a checkpoint"),
+    ):
         with pytest.raises(UserError, match=says):
             train(out, motions=folder, iterations=4)
     assert {path: path.read_bytes() for path in (*folder.iterdir(), note)} == before
@@ -240,7 +243,7 @@ def test_wrong_options_get_one_line(options: dict[str, Path], says: str, tmp_pat
 def test_wrong_subjects_and_meshes_get_one_line(fake: FakeVocaset, tmp_path: Path) -> None:
     folder, mesh = fake.write_training_files(tmp_path / "a"), fake.write_mesh(tmp_path / "sample.ply")
     out = tmp_path / "base.safetensors"
-    with pytest.raises(UserError, match="is no test subject"):
+    with pytest.raises(UserError, match="is not a test subject"):
         train(out, folder, mesh, adapt=[TRAIN[0]])
     with pytest.raises(UserError, match="needs some of sentences"):
         train(out, folder, mesh, adapt=[TEST[1]])

@@ -118,7 +118,7 @@ def test_layouts_are_told_apart_and_other_folders_refused(tmp_path: Path) -> Non
     with pytest.raises(UserError, match="there is no folder"):
         open_vocaset(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match=r"is no VOCAset: it needs data_verts\.npy"):
+    with pytest.raises(UserError, match=r"is not VOCAset: it needs data_verts\.npy"):
         open_vocaset(tmp_path / "empty")
 
 

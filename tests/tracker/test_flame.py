@@ -105,7 +105,7 @@ def test_the_51_points_are_named_symmetrically(fake: FakeFlame) -> None:
         ({"posedirs": np.zeros((3, 3, 36))}, r"posedirs is \(3, 3, 36\)"),
         ({"v_template": np.full((3, 3), np.nan)}, "v_template"),
         ({"v_template": np.full((3, 3), 1e200)}, "numbers below 1e[+]06"),
-        ({"shapedirs": "cut"}, "holds 300 shapes"),
+        ({"shapedirs": "cut"}, "of the 300 shapes"),
         ({"kintree_table": np.zeros((2, 5))}, "joints are not root"),
         ({"f": np.full((4, 3), 10_000)}, "faces name vertices"),
         ({"v_template": np.array(["a"])}, r"v_template is \(1,\)"),
