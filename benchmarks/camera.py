@@ -30,7 +30,9 @@ def measure(path: Path, head: HeadModel) -> tuple[Camera, Bundle, float]:
     frames, _ = find_usable(info)
     landmarks, _, features = read_face(path, frames)
     start = time.perf_counter()
-    camera, bundle = estimate_camera(landmarks, features, head, frames.segment, recorded_mm=info.focal_mm)
+    camera, bundle = estimate_camera(
+        landmarks, features, head, frames.usable, frames.segment, recorded_mm=info.focal_mm
+    )
     return camera, bundle, time.perf_counter() - start
 
 

@@ -155,7 +155,9 @@ def watched(video: Path, head: HeadModel, recorded_mm: float = 0.0) -> Clip:
     frames, _ = find_usable(info)
     landmarks, appearance, features = read_face(video, frames)
     recorded_mm = recorded_mm or info.focal_mm
-    camera, bundle = estimate_camera(landmarks, features, head, frames.segment, recorded_mm=recorded_mm)
+    camera, bundle = estimate_camera(
+        landmarks, features, head, frames.usable, frames.segment, recorded_mm=recorded_mm
+    )
     spent = (clock() - start) / len(frames.time)
     return Clip(landmarks, camera, bundle, frames.usable, frames.segment, appearance, video, spent)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import logging
 import os
 import signal
 import sys
@@ -102,6 +103,8 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Names of files that are no text are printed as they are.
         sys.stdout.reconfigure(errors="surrogateescape")
+    # That it finds no place for its fonts is nobody's concern.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     interruptions = _interruptions()
     try:
         code = app(arguments, standalone_mode=False)

@@ -82,7 +82,10 @@ class Source:
         self._file = _open_file(path, wanted)
         try:
             options = {"protocol_whitelist": "none"}
-            self.container: Any = av.open(self._file, mode="r", container_options=options)
+            # A title in the letters of an old system makes no film unreadable.
+            self.container: Any = av.open(
+                self._file, mode="r", container_options=options, metadata_errors="replace"
+            )
         except (av.FFmpegError, OSError, ValueError) as error:
             self._file.close()
             reason = str(getattr(error, "strerror", None) or error).splitlines()[0]
@@ -111,7 +114,9 @@ class Source:
         while True:
             try:
                 packet = next(packets)
-            except (StopIteration, av.FFmpegError):
+            # IndexError: PyAV's own at the end of a file in which a stream began that was not there before, as where
+            # recordings were joined byte by byte.
+            except (StopIteration, av.FFmpegError, IndexError):
                 return
             try:
                 frames = packet.decode()
@@ -177,13 +182,22 @@ def square_size(stream: Any, frame: Any) -> tuple[int, int]:
 
 def display_matrix(frame: Any) -> NDArray[np.int64]:
     """[2, 2] of -1, 0, 1 that takes a row (x, y) as stored upright: quarter turns and mirrors."""
-    for side in frame.side_data:
+    for side in _beside(frame):
         if side.type == SideData.DISPLAYMATRIX:
             numbers = np.frombuffer(bytes(memoryview(side)), dtype="<i4")
             matrix = np.round(numbers[[0, 1, 3, 4]].reshape(2, 2) / 65536).clip(-1, 1).astype(np.int64)
             if abs(round(float(np.linalg.det(matrix)))) == 1 and np.abs(matrix).sum() == 2:
                 return matrix
-    return np.eye(2, dtype=np.int64)
+    turn = np.radians(frame.rotation)
+    return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).round().astype(np.int64)
+
+
+def _beside(frame: Any) -> list[Any]:
+    """What is stored beside a picture; nothing where FFmpeg knows a kind that PyAV does not, as EXIF."""
+    try:
+        return list(frame.side_data)
+    except ValueError:
+        return []
 
 
 def quantizer(path: Path) -> float:
@@ -201,7 +215,7 @@ def quantizer(path: Path) -> float:
 
 def _quantizer(frame: Any) -> float | None:
     """Of a picture of H.264, the mean of its blocks; None if it does not tell."""
-    for side in frame.side_data:
+    for side in _beside(frame):
         if side.type == SideData.VIDEO_ENC_PARAMS:
             data = memoryview(side)
             blocks = np.frombuffer(data, _CODED_BLOCKS, count=1)[0]

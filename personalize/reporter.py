@@ -30,7 +30,6 @@ class Reporter:
         self._stage_started = 0.0
         self._last_line = 0.0
         self._counted = (0, 0, 0.0)  # total, done and time when this count began
-        self.warnings: list[str] = []
 
     def log_to(self, path: Path) -> None:
         """Append everything said from now on to `path`."""
@@ -38,12 +37,11 @@ class Reporter:
 
     def say(self, text: str) -> None:
         """One line for the user."""
-        self._console.print(text, markup=False)
+        self._console.print(text, markup=False, emoji=False)
         self._write_log(text)
 
     def warn(self, text: str) -> None:
         """One line the user should act on."""
-        self.warnings.append(text)
         self.say(f"warning: {text}")
 
     def cached(self, stage: str) -> None:

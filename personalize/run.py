@@ -81,7 +81,8 @@ class RunFolder:
                 )
             run._state["video"] = identity
             return run
-        if path.is_file() or (path.is_dir() and any(entry.name != ".lock" for entry in path.iterdir())):
+        begun = {".lock", ".run.json.partial"}  # by one that was killed in its first moment
+        if path.is_file() or (path.is_dir() and any(entry.name not in begun for entry in path.iterdir())):
             raise UserError(f"{path}: exists and is not a run folder; choose another with --out")
         return cls(path, {"schema": SCHEMA, "tool": "", "video": identity, "settings": {}, "stages": {}})
 

@@ -48,11 +48,22 @@ def speech_model_assets(settings: Settings) -> dict[str, str]:
     return {"base": _asset_hash(base_path(settings)), "encoder": load_encoder(settings.encoder).name}
 
 
+def face_assets() -> dict[str, str]:
+    """The network that reads faces, and what its points err by, by content."""
+    return {
+        "face_landmarker": _asset_hash(LANDMARKER_FILE),
+        "landmark_bias": _asset_hash(tracker.landmark_bias.ASSET),
+    }
+
+
 class Ingest(Stage):
     """Video -> times, usable frames and why not, sound, split."""
 
-    name, version, needs = "ingest", 15, (VIDEO,)
+    name, version, needs = "ingest", 16, (VIDEO,)
     makes = ("media.json", "frames.npz", "audio.wav", "split.json")
+
+    def assets(self, settings: Settings) -> dict[str, str]:
+        return face_assets()
 
     def make(self, context: Context, folder: Path) -> None:
         ingested = ingest_video(context.run.video, context.report.progress)
@@ -71,14 +82,11 @@ class Ingest(Stage):
 class LandmarkStage(Stage):
     """478 points and 52 scores on every frame that shows the face, what covers or blurs it, and rigid features."""
 
-    name, version = "landmarks", 12
+    name, version = "landmarks", 13
     needs, makes = (VIDEO, "ingest/frames.npz"), ("landmarks.npz", "appearance.npz", "features.npz")
 
     def assets(self, settings: Settings) -> dict[str, str]:
-        return {
-            "face_landmarker": _asset_hash(LANDMARKER_FILE),
-            "landmark_bias": _asset_hash(tracker.landmark_bias.ASSET),
-        }
+        return face_assets()
 
     def make(self, context: Context, folder: Path) -> None:
         frames = files.read_frames(context.run.path / "ingest/frames.npz")
@@ -91,7 +99,7 @@ class LandmarkStage(Stage):
 class CameraStage(Stage):
     """Focal length with its uncertainty, and rigid head poses."""
 
-    name, version, reads = "camera", 14, ("focal_px", "distortion")
+    name, version, reads = "camera", 15, ("focal_px", "distortion")
     needs = (
         *("ingest/media.json", "ingest/frames.npz", "landmarks/landmarks.npz"),
         "landmarks/features.npz",
@@ -103,11 +111,13 @@ class CameraStage(Stage):
 
     def make(self, context: Context, folder: Path) -> None:
         root = context.run.path
+        frames = files.read_frames(root / "ingest/frames.npz")
         camera, bundle = estimate_camera(
             files.read_landmarks(root / "landmarks/landmarks.npz"),
             files.read_features(root / "landmarks/features.npz"),
             run_head(context.settings),
-            files.read_frames(root / "ingest/frames.npz").segment,
+            frames.usable,
+            frames.segment,
             focal_given=context.settings.focal_px,
             distortion=context.settings.distortion,
             recorded_mm=context.run.read_json("ingest/media.json")["focal_mm"],
@@ -119,7 +129,7 @@ class CameraStage(Stage):
 class TrackStage(Stage):
     """One identity, and expression, pose and gaze in every frame, jointly over the clip."""
 
-    name, version = "track", 14
+    name, version = "track", 15
     needs = (
         *("ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz"),
@@ -148,7 +158,7 @@ class TrackStage(Stage):
 class Refine(Stage):
     """The track again, with the grey levels of the skin."""
 
-    name, folder, version = "refine", "photometric", 31
+    name, folder, version = "refine", "photometric", 32
     needs = (
         *(VIDEO, "ingest/frames.npz", "landmarks/landmarks.npz", "landmarks/appearance.npz"),
         *("camera/camera.json", "camera/bundle.npz", "track/track.npz"),
@@ -229,7 +239,7 @@ class Overlay(Stage):
     """The track over the video, to check by eye."""
 
     name, version, reads = "overlay", 5, ("overlay",)
-    needs = (VIDEO, "ingest/frames.npz", "ingest/audio.wav", "landmarks/landmarks.npz", *JUDGED)
+    needs = (VIDEO, "landmarks/landmarks.npz", *JUDGED)
     makes, products = ("contact_sheet.png", "preview.mp4"), ("overlay.mp4",)
 
     def assets(self, settings: Settings) -> dict[str, str]:
@@ -276,7 +286,7 @@ class Finetune(Stage):
 class Evaluate(Stage):
     """Metrics on the test split, one clip beside its reference, the report."""
 
-    name, folder, version, reads = "evaluate", "evaluation", 4, ("seed", "overlay", "tracked")
+    name, folder, version, reads = "evaluate", "evaluation", 5, ("seed", "overlay", "tracked")
     needs = (
         *(VIDEO, *Finetune.needs, "checkpoint.safetensors", "finetune/guidance.json", "finetune/log.csv"),
         *("overlay/preview.mp4", "overlay/contact_sheet.png", *JUDGED),

@@ -109,7 +109,6 @@ def _resampled(face: TrackedFace, at: F64, time: F64) -> TrackedFace:
         rotation=turned,
         focal=face.focal,
         principal=face.principal,
-        source=face.source,
         **joints,
     )
 

@@ -40,7 +40,7 @@ class TrackedFace:
 
     identity: [Ki]. expression: [n, Ke]. jaw, neck: [n, 3] and eyes: [n, 2, 3] axis-angle rad. rotation: [n, 3, 3] and
     translation: [n, 3] m, head to OpenCV camera. focal: px, the same for all frames. principal: [2] px, pixel centres
-    at integers. source: the tracker's name.
+    at integers.
     """
 
     identity: F64
@@ -52,7 +52,6 @@ class TrackedFace:
     translation: F64
     focal: float
     principal: F64
-    source: str
 
     def __len__(self) -> int:
         return len(self.expression)
@@ -133,7 +132,6 @@ def _metrical(paths: list[Path], head: HeadModel) -> TrackedFace:
         translation=stack("camera", "t", 3) @ PYTORCH3D_TO_OPENCV,
         focal=float(focal),
         principal=principal - 0.5,  # pixel edges at integers there
-        source="metrical-tracker",
     )
 
 
@@ -167,7 +165,6 @@ def _vhap(path: Path, head: HeadModel) -> TrackedFace:
         translation=translation @ OPENGL_TO_OPENCV,
         focal=float(rows("focal_length", 1)[0] * max(height, width)),
         principal=np.array([width, height]) / 2 - 0.5,
-        source="VHAP",
     )
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 FACING = np.diag([1.0, -1.0, -1.0])  # head axes (y up, z out of the face) to camera axes (y down, z forward)
 POSE = 6  # rotation and translation
+TOGETHER = 1000  # frames, to bound memory
 
 # Upper and lower inner lip and eyelids, point above point: their distance is the opening.
 LIP_PAIRS = (
@@ -324,8 +325,12 @@ class Energy:
 
 def visibility(model: LandmarkModel, rotation: F64, translation: F64) -> F64:
     """[n, L] 0.05..1: how far each landmark's skin faces the camera; what is turned away is only guessed."""
-    matrix = rotation_matrix(rotation)
-    points = model.mean @ matrix.transpose(0, 2, 1) + translation[:, None]
-    normals = model.normals @ matrix.transpose(0, 2, 1)
-    facing = -(normals * points).sum(-1) / np.linalg.norm(points, axis=-1)
-    return np.clip((facing + 0.1) / 0.5, 0.05, 1.0)
+    seen = np.empty((len(rotation), len(model.mean)))
+    for start in range(0, len(seen), TOGETHER):
+        rows = slice(start, start + TOGETHER)
+        matrix = rotation_matrix(rotation[rows])
+        points = model.mean @ matrix.transpose(0, 2, 1) + translation[rows, None]
+        normals = model.normals @ matrix.transpose(0, 2, 1)
+        facing = -(normals * points).sum(-1) / np.linalg.norm(points, axis=-1)
+        seen[rows] = np.clip((facing + 0.1) / 0.5, 0.05, 1.0)
+    return seen

@@ -25,7 +25,7 @@ from tracker.energy import (
     visibility,
 )
 from tracker.gaze import eye_rotations
-from tracker.key_frames import KeyFrames, key_frames
+from tracker.key_frames import FEW, KeyFrames, key_frames
 from tracker.landmarker import MIN_PRESENCE
 from tracker.similarity import similarity
 from tracker.solver import Smoothness, solve_frames, solve_subject
@@ -83,9 +83,9 @@ def _share(evidence: F32 | None, good: Frames) -> F64:
 
 
 def trusted(evidence: F32 | None, good: Frames) -> Frames:
-    """Rows of the frames `good` [n] that tell something on their own; see `fit_track`."""
+    """Rows of the frames `good` [n] that tell something on their own, see `fit_track`; of the best if few do."""
     share = _share(evidence, good)
-    return np.flatnonzero(share >= min(0.5, share.max()))
+    return np.flatnonzero(share >= min(0.5, np.sort(share)[-min(FEW, len(share))]))
 
 
 def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.bool_]) -> Frames:

@@ -270,8 +270,10 @@ def _stretches(
             yield start, held
             start += STRETCH
             held = {row: cut for row, cut in held.items() if row >= start - overlap}
-    if any(row >= start for row in held):
+    while any(row >= start for row in held):  # the film may break off
         yield start, held
+        start += STRETCH
+        held = {row: cut for row, cut in held.items() if row >= start - overlap}
 
 
 def _relative(deviation: F64, good: Index, total: int) -> F32:

@@ -22,14 +22,17 @@ from tracker.track import F32, F64, Landmarks
 ENLARGED, QUICK_S = 0.14, 0.5
 
 
-def zoom_of_frames(landmarks: Landmarks, segment: NDArray[np.int32], head: HeadModel) -> F32:
+def zoom_of_frames(
+    landmarks: Landmarks, usable: NDArray[np.bool_], segment: NDArray[np.int32], head: HeadModel
+) -> F32:
     """[T, 3] times that each frame's picture is enlarged, and x, y px of the place that stays; [0, 3] if none is.
 
-    segment: [T], number of the uninterrupted shot. Nothing in a face tells a longer lens from a shorter way, so where
-    it is larger or smaller than in most frames it is taken to be as far away as there. What stays is the picture's
-    middle, of editors as of lenses, or the face's where a smaller one would come to lie beyond the picture's edge.
+    usable: [T], frames that show the person. segment: [T], number of the uninterrupted shot. Nothing in a face tells a
+    longer lens from a shorter way, so where it is larger or smaller than in most frames it is taken to be as far away
+    as there. What stays is the picture's middle, of editors as of lenses, or the face's where a smaller one would come
+    to lie beyond the picture's edge.
     """
-    size = _sizes(landmarks, head)
+    size = _sizes(landmarks, usable, head)
     known = np.flatnonzero(np.isfinite(size))
     if not len(known):
         return never()
@@ -49,14 +52,14 @@ def zoom_of_frames(landmarks: Landmarks, segment: NDArray[np.int32], head: HeadM
     return zoom.astype(np.float32) if enlarged.any() else never()
 
 
-def _sizes(landmarks: Landmarks, head: HeadModel) -> F64:
-    """[T] logarithms of px per metre of the upper face; NaN without a face, or one that is turned far aside."""
+def _sizes(landmarks: Landmarks, usable: NDArray[np.bool_], head: HeadModel) -> F64:
+    """[T] logarithms of px per metre of the person's upper face; NaN unseen, or turned far aside."""
     embedding = head.landmark_embedding
     rigid = of_rigid_face(embedding.landmarks)
     nothing = np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis))
     mean = head.landmark_positions(*nothing)[rigid].astype(np.float64)
     size = np.full(len(landmarks.time), np.nan)
-    seen = np.flatnonzero(np.isfinite(landmarks.points).all((1, 2)))
+    seen = np.flatnonzero(usable & np.isfinite(landmarks.points).all((1, 2)))
     if len(seen):
         seen = seen[turned_as_usual(landmarks.points[seen])]
         points = landmarks.points[seen][:, embedding.landmarks[rigid]].astype(np.float64)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from av.sidedata.sidedata import Type as SideData
 
-from personalize.container import _duration, _prominence, _quantizer, probe, quantizer
+from personalize.container import Source, _duration, _prominence, _quantizer, display_matrix, probe, quantizer
 from personalize.errors import UserError
 from personalize.pictures import FrameReader, _ahead, _in_time, _turned
 from personalize.sound import on_video_clock, read_audio, write_wav
@@ -49,6 +49,60 @@ def test_rotation_metadata_is_applied(tmp_path: Path, rotation: int) -> None:
     assert (info.width, info.height) == (96, 64)
     _, picture = next(FrameReader(path))
     assert np.abs(picture.astype(int) - upright)[4:-4, 4:-4].mean() < 8
+
+
+class Unknown:
+    """A picture of a film beside which FFmpeg finds what PyAV has no name for."""
+
+    def __init__(self, frame: av.VideoFrame) -> None:
+        self._frame = frame
+
+    @property
+    def side_data(self) -> list[object]:
+        raise ValueError("31 is not a valid Type")
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._frame, name)
+
+
+@pytest.mark.parametrize("rotation", [0, 90, 180, 270])
+def test_pictures_are_turned_where_something_unknown_lies_beside_them(tmp_path: Path, rotation: int) -> None:
+    path = write_video(tmp_path / "v.mp4", moving(1), STEADY[:1], rotation=rotation)
+    with Source(path) as source:
+        frame = next(source.decode(source.video))
+    np.testing.assert_array_equal(display_matrix(Unknown(frame)), display_matrix(frame))
+    assert _quantizer(Unknown(frame)) is None
+
+
+def test_a_title_in_old_letters_makes_no_film_unreadable(tmp_path: Path) -> None:
+    path = tmp_path / "v.mkv"
+    with av.open(str(path), "w", metadata_encoding="latin-1") as out:
+        out.metadata["title"] = "Caf\xe9"
+        stream = out.add_stream("mpeg4", rate=25)
+        stream.width, stream.height = 96, 64
+        for picture in moving(3):
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        out.mux(stream.encode(None))
+    assert b"Caf\xe9" in path.read_bytes()
+    assert len(list(FrameReader(path))) == 3
+
+
+def test_of_recordings_joined_byte_by_byte_the_first_is_read(tmp_path: Path) -> None:
+    """The second one's streams bear other numbers; FFmpeg finds them when it comes to them."""
+    content = b""
+    for seed, number in enumerate((256, 512)):
+        path = tmp_path / f"{number}.ts"
+        numbers = {"mpegts_start_pid": str(number), "mpegts_pmt_start_pid": str(number + 200)}
+        with av.open(str(path), "w", options=numbers) as out:
+            stream = out.add_stream("libx264", rate=25)
+            stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+            for picture in moving(25, seed):
+                out.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            out.mux(stream.encode(None))
+        content += path.read_bytes()
+    joined = tmp_path / "joined.ts"
+    joined.write_bytes(content)
+    assert len(list(FrameReader(joined))) == 25
 
 
 @pytest.mark.parametrize("swapped", [False, True])
@@ -371,7 +425,13 @@ def test_damage_lasts_until_the_next_key_and_five_seconds_at_most(
     path = write_video(tmp_path / "v.mkv", moving(3), STEADY[:3])
     frames = [
         SimpleNamespace(
-            width=96, height=64, side_data=[], interlaced_frame=False, is_corrupt=n == 10, key_frame=n in keys
+            width=96,
+            height=64,
+            side_data=[],
+            rotation=0,
+            interlaced_frame=False,
+            is_corrupt=n == 10,
+            key_frame=n in keys,
         )
         for n in range(30)
     ]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from typing import cast
 from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from personalize.people import (
     OTHER_PERSON,
@@ -23,6 +25,7 @@ from personalize.people import (
 )
 from tests.personalize.people_factory import tracklet
 from tracker.face_detector import Face
+from tracker.landmark_bias import landmark_bias
 from tracker.landmarker import FaceLandmarker, Roi
 
 
@@ -244,46 +247,70 @@ def test_a_face_that_is_soon_seen_again_nearly_where_it_was_is_the_same(
     assert len(follower.tracklets) == tracklets
 
 
+def shot(
+    frames: range, turns_deg: Sequence[float], jaw: float = 0.0, person: int = 0, hair: int = 0
+) -> Tracklet:
+    """Looks at the mean head with a shape and hair of its own, turned to its left by so much and a jaw so far down."""
+    bias, draw = landmark_bias(), np.random.default_rng
+    face = bias.mean + 0.006 * bool(person) * draw(person).standard_normal(bias.mean.shape)
+    face[:, 1] -= jaw * np.clip(-0.02 - bias.mean[:, 1], 0, None)
+    made = tracklet(1, frames)
+    portrait = draw(hair).integers(0, 255, (14, 12)).astype(np.uint8)
+    samples = []
+    for turn in turns_deg:
+        points = np.zeros((478, 3), np.float32)
+        turned = face @ Rotation.from_euler("y", turn, degrees=True).as_matrix().T
+        points[bias.landmarks] = 900 * turned * (1, -1, -1) + (320, 240, 0)
+        samples.append((points, portrait))
+    made.sightings = [
+        replace(seen, sample=sample) for seen, sample in zip_longest(made.sightings[: len(frames)], samples)
+    ]
+    return made
+
+
 def test_people_are_told_apart_by_the_shape_of_the_face_and_by_how_the_head_looks() -> None:
-    """Either is enough; a pose, a size and other light are not."""
-    one, other = tracklet(1, range(0, 30)), tracklet(2, range(40, 70))
-    pose = np.asarray(one.shapes[0], np.float64)
+    """Either is enough; light, size, and how it is turned in the picture are not."""
+    one = shot(range(0, 30), (0, 5, 10))
+    paler = shot(range(40, 70), (0, 5, 10))
+    tilt = np.array([[0.0, -1.3, 0.0], [1.3, 0.0, 0.0], [0.0, 0.0, 1.3]])
+    paler.sightings = [
+        (seen.sample and replace(seen, sample=(seen.sample[0] @ tilt, seen.sample[1] // 2))) or seen
+        for seen in paler.sightings
+    ]
+    shape, hair = shot(range(80, 110), (0, 5), person=1), shot(range(120, 150), (0, 5), hair=1)
+    both = shot(range(160, 190), (0, 5), person=1, hair=1)
+    apart_from_one = differences([one, paler, shape, hair, both])[0]
+    assert apart_from_one[:2].max() < 0.1 and min(apart_from_one[2:4]) > OTHER_PERSON / 2
+    assert apart_from_one[4] == pytest.approx(sum(apart_from_one[2:4]), abs=0.1)
 
-    def mixed(shape: Tracklet, portrait: Tracklet, light: float = 1.0) -> Tracklet:
-        made = tracklet(1, range(80, 110))
-        turn = np.array([[0.0, -1.3, 0.0], [1.3, 0.0, 0.0], [0.0, 0.0, 1.3]])
-        samples = [(s @ turn, light * p) for s, p in zip(shape.shapes, portrait.portraits)]
-        made.sightings = [replace(made.sightings[0], sample=sample) for sample in samples]
-        return made
 
-    faces = one, mixed(one, one, 0.5), mixed(other, one), mixed(one, other), mixed(other, other)
-    _, same, shape, portrait, both = differences(faces, pose)[0]
-    assert same < 0.2 and min(shape, portrait) > OTHER_PERSON / 2
-    assert both == pytest.approx(shape + portrait, abs=0.1)
+def test_shots_of_one_person_are_compared_where_they_are_most_alike() -> None:
+    """In one the head faces the camera mostly, in the other it is turned aside mostly, and talks."""
+    straight, aside = shot(range(0, 30), (0, 0, 0, 30)), shot(range(40, 70), (-30, 30, 30, 30), jaw=0.3)
+    straight.sightings[3] = replace(straight.sightings[3], sample=aside.sightings[1].sample)
+    assert differences([straight, aside])[0, 1] == pytest.approx(0, abs=1e-6)
 
 
 def test_a_shot_is_of_the_person_whose_other_shots_it_looks_like() -> None:
-    """Not of whom the longest shot alone looks like: a laugh, or a face turned aside."""
-    laugh, longest = np.random.default_rng(3).normal(size=(2, 478, 3))
-
-    def shot(first: int, frames: int, laughs: float, like_longest: float = 0.0) -> Tracklet:
-        made = tracklet(1, range(first, first + frames), seed=first)
-        made.sightings = [
-            replace(
-                seen,
-                sample=seen.sample
-                and (seen.sample[0] + (10 * (laughs * laugh + like_longest * longest)), seen.sample[1]),
-            )
-            for seen in made.sightings
-        ]
-        return made
-
-    mine = [shot(0, 90, 0.0, 0.4), *(shot(100 * k, 30, 0.3 * k) for k in range(1, 5))]
-    other = shot(600, 30, 0.0, 1.3)
-    looks = differences([*mine, other], np.asarray(mine[0].shapes[0], np.float64))[0]
-    assert looks[4] > OTHER_PERSON > looks[5] and looks.argmax() == 4
+    """Not of whom the longest one looks like: a mouth that opens wider and wider."""
+    mine = [
+        shot(range(0, 90), (0,)),
+        *(shot(range(100 * k, 100 * k + 30), (0,), jaw=0.25 * k) for k in range(1, 5)),
+    ]
+    other = shot(range(600, 630), (0,), person=1)
+    looks = differences([*mine, other])
+    assert looks[0, 4] > OTHER_PERSON and looks[:5, 5].min() > OTHER_PERSON
     kept, left = main_person([other, *mine])
     assert {id(t) for t in kept} == {id(t) for t in mine} and left == [other]
+
+
+def test_nobody_is_joined_to_two_faces_that_are_seen_at_once() -> None:
+    """A shot that looks like either is of the one that it looks like more."""
+    left_of, right_of = shot(range(0, 50), (0,)), shot(range(0, 50), (0,), jaw=0.3)
+    later = shot(range(60, 200), (0,), jaw=0.1)
+    assert differences([left_of, right_of, later]).max() < OTHER_PERSON
+    kept, _ = main_person([right_of, left_of, later])
+    assert {id(t) for t in kept} == {id(left_of), id(later)}
 
 
 def test_of_two_faces_alike_that_are_seen_together_one_is_the_person() -> None:

@@ -71,3 +71,9 @@ def test_names_that_are_no_text_are_written_all_the_same(tmp_path: Path) -> None
     write_text(tmp_path / "report.html", name)
     for file in tmp_path.iterdir():
         assert "caf" in file.read_text(encoding="utf-8")
+
+
+def test_a_name_is_said_as_it_is_written() -> None:
+    stream = io.StringIO()
+    Reporter(stream).say("talk :car: [red].mp4")
+    assert stream.getvalue() == "talk :car: [red].mp4\n"

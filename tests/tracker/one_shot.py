@@ -15,4 +15,5 @@ from tracker.track import Bundle, Camera, Landmarks
 def estimate_camera(
     landmarks: Landmarks, features: FeatureTracks, head: HeadModel, **given: Any
 ) -> tuple[Camera, Bundle]:
-    return camera.estimate_camera(landmarks, features, head, np.zeros(len(landmarks.time), np.int32), **given)
+    everywhere, one_shot = np.ones(len(landmarks.time), bool), np.zeros(len(landmarks.time), np.int32)
+    return camera.estimate_camera(landmarks, features, head, everywhere, one_shot, **given)

@@ -212,16 +212,16 @@ def test_a_given_lens_is_taken_out(head: HeadModel) -> None:
 def test_shots_that_are_enlarged_are_put_back(head: HeadModel) -> None:
     marks, tracks, _ = _talk(head, 15)
     times = np.where(np.arange(len(marks.time)) < len(marks.time) // 3, 1.4, 1.0)
-    shots = (times == 1).astype(np.int32)
+    shots, everywhere = (times == 1).astype(np.int32), np.ones(len(times), bool)
     points, seen = marks.points.copy(), tracks.observations.copy()
     points[..., :2] = CENTRE + times[:, None, None] * (points[..., :2] - CENTRE)
     points[..., 2:] *= times[:, None, None]
     seen[:, 2:] = CENTRE + times[seen[:, 0].astype(int), None] * (seen[:, 2:] - CENTRE)
     shown = replace(marks, points=points), replace(tracks, observations=seen)
     (as_filmed, straight), (camera, bundle) = (
-        subject.estimate_camera(*clip, head, shots) for clip in ((marks, tracks), shown)
+        subject.estimate_camera(*clip, head, everywhere, shots) for clip in ((marks, tracks), shown)
     )
-    given, _ = subject.estimate_camera(*shown, head, shots, focal_given=FOCAL)
+    given, _ = subject.estimate_camera(*shown, head, everywhere, shots, focal_given=FOCAL)
     assert not len(as_filmed.zoom) and not len(given.zoom)
     np.testing.assert_allclose(camera.zoom[:, 0], times, rtol=0.05)
     assert camera.focal_px == pytest.approx(as_filmed.focal_px, rel=0.05)

@@ -422,6 +422,15 @@ def test_stretches_cover_every_frame_once(total: int, overlap: int):
     assert covered == list(range(total))
 
 
+@pytest.mark.parametrize("there", [119, 120, 121, 126, 128, 246])
+def test_what_a_film_that_breaks_off_shows_is_in_a_stretch(there: int):
+    pictures = ((row, np.zeros(0, np.uint8)) for row in range(there))
+    covered = [
+        row for start, held in _stretches(pictures, 1000, 8) for row in held if start <= row < start + 120
+    ]
+    assert covered == list(range(there))
+
+
 @pytest.mark.parametrize(("rate", "frames"), [(25, 8), (60, 19), (10, 8), (240, 77), (90_000, 120)])
 def test_stretches_overlap_for_a_time_and_not_beyond_what_is_solved(rate: int, frames: int):
     assert _overlap(np.arange(50) / rate) == frames
