@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+EDGE = 65  # points along an edge
 CONVERGED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)  # px
 
 
@@ -34,12 +36,7 @@ class Lens:
     def points(self, xy: NDArray[np.floating], frames: NDArray[np.integer]) -> F64:
         """Points [n, ..., 2] px of the frames [n] as a camera without distortion and zoom would see them."""
         flat = self._smaller(xy.astype(np.float64), frames)
-        if not self.distortion or not flat.size:
-            return flat
-        matrix, coefficients = self._opencv()
-        seen = flat.reshape(-1, 1, 2)
-        straight = cv2.undistortPoints(seen, matrix, coefficients, P=matrix, criteria=CONVERGED)
-        return straight.reshape(flat.shape)
+        return self._straight(flat) if self.distortion and flat.size else flat
 
     def picture(self, rgb: NDArray[np.uint8], frame: int) -> NDArray[np.uint8]:
         """A frame's picture as a camera without distortion and zoom would see it."""
@@ -55,12 +52,24 @@ class Lens:
                 ),
                 np.uint8,
             )
-        return cv2.undistort(rgb, *self._opencv()) if self.distortion else rgb
+        if not self.distortion:
+            return rgb
+        maps = _straightened(self.focal_px, self.principal_px, self.distortion, rgb.shape[1::-1])
+        return np.asarray(cv2.remap(rgb, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
     def ends(self, size: tuple[int, int], frames: NDArray[np.integer]) -> F64:
-        """[n, 2, 2] px, first and last (x, y) that the frames [n] show of pictures of this size, without the zoom."""
-        corners = np.tile([[0.0, 0.0], [size[0] - 1, size[1] - 1]], (len(frames), 1, 1))
-        return np.clip(self._smaller(corners, frames), corners[:, :1], corners[:, 1:])
+        """[n, 2, 2] px, first and last (x, y) that the frames [n] show of pictures of this size, see `picture`."""
+        last = np.array(size, np.float64) - 1
+        corners = np.tile([np.zeros(2), last], (len(frames), 1, 1))
+        shown = np.clip(self._smaller(corners, frames), corners[:, :1], corners[:, 1:])
+        if self.distortion:
+            along = np.linspace(0, 1, EDGE)[:, None] * last
+            first, beyond = along * (0, 1), along * (1, 0)  # left and upper edge
+            left, top = self._straight(first)[:, 0].max(), self._straight(beyond)[:, 1].max()
+            right = self._straight(first + last * (1, 0))[:, 0].min()
+            bottom = self._straight(beyond + last * (0, 1))[:, 1].min()
+            shown = np.clip(shown, (left, top), (right, bottom))
+        return shown
 
     def times(self, frames: NDArray[np.integer]) -> F64:
         """[n] times that the pictures of the frames [n] are enlarged."""
@@ -73,8 +82,27 @@ class Lens:
         about = self.zoom[frames, 1:].astype(np.float64).reshape(-1, *[1] * (xy.ndim - 2), 2)
         return about + (xy - about) / self.times(frames).reshape(-1, *[1] * (xy.ndim - 1))
 
-    def _opencv(self) -> tuple[F64, F64]:
-        """Camera matrix [3, 3] and distortion [5]."""
-        k1, k2, k3 = (*self.distortion, 0.0, 0.0)[:3]
-        (cx, cy), f = self.principal_px, self.focal_px
-        return np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]]), np.array([k1, k2, 0.0, 0.0, k3])
+    def _straight(self, xy: F64) -> F64:
+        """Points [..., 2] px without the distortion."""
+        matrix, coefficients = _opencv(self.focal_px, self.principal_px, self.distortion)
+        seen = xy.reshape(-1, 1, 2)
+        straight = cv2.undistortPoints(seen, matrix, coefficients, P=matrix, criteria=CONVERGED)
+        return straight.reshape(xy.shape)
+
+
+def _opencv(
+    focal_px: float, principal_px: tuple[float, float], distortion: tuple[float, ...]
+) -> tuple[F64, F64]:
+    """Camera matrix [3, 3] and distortion [5]."""
+    k1, k2, k3 = (*distortion, 0.0, 0.0)[:3]
+    (cx, cy), f = principal_px, focal_px
+    return np.array([[f, 0, cx], [0, f, cy], [0, 0, 1.0]]), np.array([k1, k2, 0.0, 0.0, k3])
+
+
+@lru_cache(maxsize=1)
+def _straightened(
+    focal_px: float, principal_px: tuple[float, float], distortion: tuple[float, ...], size: tuple[int, int]
+) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+    """Where in a picture of this size (width, height) each pixel of the straight one is, as cv2.remap has it."""
+    matrix, coefficients = _opencv(focal_px, principal_px, distortion)
+    return cv2.initUndistortRectifyMap(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_16SC2)

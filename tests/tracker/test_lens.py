@@ -74,6 +74,18 @@ def test_where_an_enlarged_picture_ends() -> None:
     np.testing.assert_allclose(ends, [whole, [[50, 100], [369.5, 339.5]], whole])
 
 
+def test_a_picture_ends_where_the_lens_saw_nothing_more() -> None:
+    """Beyond, the straight picture goes on as its edge is."""
+    picture = np.full((480, 640, 3), 200, np.uint8)
+    pincushion, barrel = (Lens(FOCAL, PRINCIPAL, (k1,)) for k1 in (0.1, -0.1))
+    ((left, top), (right, bottom)) = pincushion.ends((640, 480), np.array([0]))[0]
+    seen_at = seen(np.array([[left, y] for y in (top, 120.0, 239.5)]), (0.1,))
+    assert 10 < left < 60 and top > 0 and seen_at[:, 0].min() == pytest.approx(0, abs=0.5)
+    assert (right, bottom) == pytest.approx((639 - left, 479 - top), abs=0.01)
+    assert (pincushion.picture(picture, 0) == 200).all()
+    np.testing.assert_array_equal(barrel.ends((640, 480), np.array([0]))[0], [[0, 0], [639, 479]])
+
+
 def test_what_is_too_fine_for_the_smaller_picture_is_taken_out() -> None:
     stripes = np.zeros((60, 80, 3), np.uint8)
     stripes[:, ::2] = 255
