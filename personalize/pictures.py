@@ -35,11 +35,11 @@ Item = TypeVar("Item")
 class FrameReader(Iterator[tuple[float, U8]]):
     """Pictures of a video in order: (time s from the first picture, rgb [H, W, 3] u8 with square pixels).
 
-    Times are strictly rising. After each step `damaged` says whether that picture was decoded from broken
-    data or predicted from such a picture; pictures that do not decode at all are missing. `interlaced`: how many were
-    of two fields. `resized_s`: when their size first changed, s; NaN if it did not. Every pass over a file gives the
-    same pictures. Raises UserError like `probe`, beyond the limits, where the clock is set back, where the pictures'
-    shape changes, and of colours that FFmpeg cannot read.
+    Times are strictly rising. After each step `damaged` says whether that picture was decoded from broken data or
+    predicted from such a picture; pictures that do not decode at all are missing. `interlaced`: how many were of two
+    fields. `resized_s`: when their size first changed, s; NaN if it did not. Every pass over a file gives the same
+    pictures, but for what a decoder makes up in damaged ones. Raises UserError like `probe`, beyond the limits, where
+    the clock is set back, where the pictures' shape changes, and of colours that FFmpeg cannot read.
     """
 
     def __init__(self, path: Path | str, max_side: int | None = None) -> None:
