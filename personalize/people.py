@@ -323,7 +323,8 @@ def _persons(faces: list[Tracklet]) -> list[NDArray[np.int64]]:
     at_once = (first[:, None] <= last) & (first <= last[:, None])
     pairs = np.argwhere(np.triu(apart < OTHER_PERSON, 1))
     for one, other in pairs[np.argsort(apart[tuple(pairs.T)])]:
-        mine, theirs = number == number[one], number == number[other]
-        if number[one] != number[other] and not at_once[np.ix_(mine, theirs)].any():
-            number[theirs] = number[one]
+        if number[one] != number[other]:
+            mine, theirs = number == number[one], number == number[other]
+            if not at_once[np.ix_(mine, theirs)].any():
+                number[theirs] = number[one]
     return [np.flatnonzero(number == one) for one in np.unique(number)]
