@@ -31,7 +31,7 @@ def measure(path: Path, head: HeadModel) -> tuple[Camera, Bundle, float]:
     landmarks, _, features = read_face(path, frames)
     start = time.perf_counter()
     camera, bundle = estimate_camera(
-        landmarks, features, head, frames.usable, frames.segment, recorded_mm=info.focal_mm
+        landmarks, features, head, frames.seen, frames.segment, recorded_mm=info.focal_mm
     )
     return camera, bundle, time.perf_counter() - start
 

@@ -35,7 +35,7 @@ import argparse
 import os
 import time
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -156,7 +156,7 @@ def watched(video: Path, head: HeadModel, recorded_mm: float = 0.0) -> Clip:
     landmarks, appearance, features = read_face(video, frames)
     recorded_mm = recorded_mm or info.focal_mm
     camera, bundle = estimate_camera(
-        landmarks, features, head, frames.usable, frames.segment, recorded_mm=recorded_mm
+        landmarks, features, head, frames.seen, frames.segment, recorded_mm=recorded_mm
     )
     spent = (clock() - start) / len(frames.time)
     return Clip(landmarks, camera, bundle, frames.usable, frames.segment, appearance, video, spent)
@@ -199,8 +199,13 @@ def ground_truths(
         if wanted(path.stem, chosen)
     )
     for group, name, video, truth in chain(films, scans):
-        with enlarged(video) if larger else nullcontext(video) as shown:
+        with edited(video, larger) as shown:
             yield group, name, watched(shown, head, written_lens(truth, video, name) if lens else 0.0), truth
+
+
+def edited(video: Path, larger: bool) -> AbstractContextManager[Path]:
+    """The video, or one with every other shot enlarged."""
+    return enlarged(video) if larger else nullcontext(video)
 
 
 def compile_ahead(head: HeadModel) -> None:
@@ -276,10 +281,11 @@ def main() -> None:
                 cells = (cell(column, errors.get(key, np.nan)) for column, key in COLUMNS.items())
                 print(f"{name:16s} {stage:10s}", *cells, sep="", flush=True)
     for video in videos:
-        clip = watched(video, head)
-        for stage, track, spent in stages(clip, head):
-            figures = consistency(track, clip.landmarks) | spent
-            print(f"{video.stem} {stage}", *(f"{k} {v:.3f}" for k, v in figures.items()), flush=True)
+        with edited(video, options.enlarged) as shown:
+            clip = watched(shown, head)
+            for stage, track, spent in stages(clip, head):
+                figures = consistency(track, clip.landmarks) | spent
+                print(f"{video.stem} {stage}", *(f"{k} {v:.3f}" for k, v in figures.items()), flush=True)
     if rows:
         print_bars(rows)
 

@@ -123,8 +123,7 @@ class Crops:
         self._starts = torch.from_numpy(np.concatenate(starts))
         if len(self._starts) == 0:
             raise ModelError(
-                f"no {length} consecutive valid frames: too little of the face was tracked to learn from; look at "
-                "overlay.mp4, and film a longer clip"
+                f"no {length} consecutive valid frames: too little of the face was tracked to learn from"
             )
         motion = standardization.motion(np.nan_to_num(np.concatenate([s.coefficients for s in sequences])))
         audio = standardization.audio(np.concatenate([s.features for s in sequences]))

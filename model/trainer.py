@@ -178,8 +178,7 @@ class Trainer:
         if not math.isfinite(loss) or loss > DIVERGED * noise:
             raise TrainingDivergedError(
                 f"training diverged at iteration {self.step} (loss {loss:.3g}): the data holds outliers or is"
-                " too short; look at the overlay for frames tracked wrongly (a higher --min-confidence leaves them"
-                " out), or give more data"
+                " too short"
             )
         return loss
 

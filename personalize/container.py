@@ -181,23 +181,22 @@ def square_size(stream: Any, frame: Any) -> tuple[int, int]:
 
 
 def display_matrix(frame: Any) -> NDArray[np.int64]:
-    """[2, 2] of -1, 0, 1 that takes a row (x, y) as stored upright: quarter turns and mirrors."""
-    for side in _beside(frame):
+    """[2, 2] of -1, 0, 1 that takes a row (x, y) as stored upright: quarter turns and mirrors.
+
+    Mirrors are lost where something unknown lies beside the picture too.
+    """
+    try:
+        beside = list(frame.side_data)
+    except ValueError:  # FFmpeg knows a kind that PyAV does not, as EXIF
+        quarters = round(frame.rotation / 90) % 4
+        return np.asarray(np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarters), np.int64)
+    for side in beside:
         if side.type == SideData.DISPLAYMATRIX:
             numbers = np.frombuffer(bytes(memoryview(side)), dtype="<i4")
             matrix = np.round(numbers[[0, 1, 3, 4]].reshape(2, 2) / 65536).clip(-1, 1).astype(np.int64)
             if abs(round(float(np.linalg.det(matrix)))) == 1 and np.abs(matrix).sum() == 2:
                 return matrix
-    turn = np.radians(frame.rotation)
-    return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]).round().astype(np.int64)
-
-
-def _beside(frame: Any) -> list[Any]:
-    """What is stored beside a picture; nothing where FFmpeg knows a kind that PyAV does not, as EXIF."""
-    try:
-        return list(frame.side_data)
-    except ValueError:
-        return []
+    return np.eye(2, dtype=np.int64)
 
 
 def quantizer(path: Path) -> float:
@@ -215,7 +214,11 @@ def quantizer(path: Path) -> float:
 
 def _quantizer(frame: Any) -> float | None:
     """Of a picture of H.264, the mean of its blocks; None if it does not tell."""
-    for side in _beside(frame):
+    try:
+        beside = list(frame.side_data)
+    except ValueError:  # as for `display_matrix`
+        return None
+    for side in beside:
         if side.type == SideData.VIDEO_ENC_PARAMS:
             data = memoryview(side)
             blocks = np.frombuffer(data, _CODED_BLOCKS, count=1)[0]

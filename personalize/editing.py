@@ -162,7 +162,7 @@ def _sound_of(speech: Path, motion: Motion, encoder: SpeechEncoder, report: Repo
     offset_s = motion.sound_offset_s(sha256_file(speech))
     times += offset_s
     if not offset_s and motion.provenance.get("av_offset_s"):
-        report.say(f"{speech}: not the sound that the motion's offset was found on: none is applied")
+        report.say(f"{speech}: not the sound on which the motion's offset was found, which is not applied")
     length_s = len(times) / motion.fps
     features = speech_features(speech, times, encoder)
     return on_video_clock(sound, start_s - times[0], length_s, FILM_RATE), features

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from model.finetuning import EARLY_TOLERANCE, choose_checkpoint, subject_of, sweep_guidance
 from model.speech import load_encoder
-from model.trainer import STATE_FILE, Trainer
+from model.trainer import STATE_FILE, Trainer, TrainingDivergedError
 from model.training_config import TrainingConfig
 from personalize.errors import UserError
 from personalize.files import sha256_file, write_json
@@ -50,7 +50,13 @@ def finetune_run(run: RunFolder, settings: Settings, folder: Path, report: Repor
         TrainingConfig(iterations=settings.iterations, seed=settings.seed, device=settings.device),
         tensorboard=folder / "tensorboard",
     )
-    candidates = trainer.train(report.progress)
+    try:
+        candidates = trainer.train(report.progress)
+    except TrainingDivergedError as error:
+        raise UserError(
+            f"{run.video}: {error}; look at overlay.mp4 for frames tracked wrongly, which a higher --min-confidence "
+            "leaves out, or film a longer clip"
+        ) from error
     report.say("choosing the checkpoint and the guidance scale on the validation split")
     best, errors = choose_checkpoint(candidates, data.sequences("val"), settings.seed, EARLY_TOLERANCE)
     sweep, chosen = sweep_guidance(best, data.sequences("val"), settings.seed, report.progress)

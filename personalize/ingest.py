@@ -321,12 +321,10 @@ def _lost_in_file(media: MediaInfo, time: F64) -> list[str]:
     gaps = np.flatnonzero(np.diff(time) > MAX_GAP_S)
     if len(gaps):
         seconds, first = float(np.diff(time)[gaps].sum()), float(time[gaps[0]])
-        where = (
-            f"{len(gaps)} gaps, the first at {first:.1f} s" if len(gaps) > 1 else f"a gap at {first:.1f} s"
-        )
+        where = f"{len(gaps)} gaps, the first" if len(gaps) > 1 else "a gap"
         texts.append(
-            f"{seconds:.1f} s without pictures, in {where}: each counts as a cut; export the video again, or record it "
-            "without dropping pictures"
+            f"{seconds:.1f} s without pictures, in {where} at {first:.1f} s: the film counts as cut there; export it "
+            "again, or record it without dropping pictures"
         )
     if media.duration_s - time[-1] > 1.0:
         texts.append(

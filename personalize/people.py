@@ -35,9 +35,10 @@ SEARCH_S, SELDOM_S = 1.0, 3.0  # between searches for small faces in tiles: whil
 # film these come to .0005, people who listen to .005 in any two seconds.
 STILL, STILL_SHARE, STILL_LOOKS = 0.001, 0.75, 4
 PORTRAIT = (12, 14)  # px, width and height of the grey picture that people are told apart by
-# Shots of 2 s. People rendered (94, of one hair style): a hundredth of one's pairs lie farther apart, a hundredth of
-# two's nearer. Filmed (7): a tenth of one's, mostly of one who laughs and weeps; of two's none (whole clips: 2.4).
+# Of pairs of shots of 2 s of one person 1 % (94 people rendered) and 12 % (seven filmed, mostly of one who laughs and
+# weeps) lie farther apart; of two people's 1 % (rendered: one hair style) lie nearer, and none (filmed: 2.4 and more).
 SHAPE_SCALE, PORTRAIT_SCALE, OTHER_PERSON = 10.0, 0.25, 1.7
+MOST_LOOKS = 100  # of a face, to bound memory
 TURN = 2  # how many of the features of a face say how it is turned
 
 
@@ -92,10 +93,12 @@ class Tracklet:
         """The landmarks of its samples."""
         return [sighting.sample[0] for sighting in self.sightings if sighting.sample]
 
-    @property
-    def portraits(self) -> list[U8]:
-        """Those of its samples."""
-        return [sighting.sample[1] for sighting in self.sightings if sighting.sample]
+    def some_looks(self) -> list[tuple[F32, U8]]:
+        """MOST_LOOKS of its samples at most, spread over time."""
+        looks = [sighting.sample for sighting in self.sightings if sighting.sample]
+        return [
+            looks[k] for k in np.linspace(0, len(looks) - 1, min(len(looks), MOST_LOOKS)).round().astype(int)
+        ]
 
     @property
     def weight(self) -> float:
@@ -281,16 +284,18 @@ def differences(faces: Sequence[Tracklet]) -> F64:
     Of two looks: the distance of their shapes, without what goes with how they are turned (see
     tracker.landmark_bias), and the lack of correlation of their portraits.
     """
-    scores = [landmark_bias().features(np.asarray(face.shapes))[0][:, TURN:] for face in faces]
-    portraits = np.array([portrait.ravel() for face in faces for portrait in face.portraits], np.float64)
+    looks = [face.some_looks() for face in faces]
+    first = np.cumsum([0, *map(len, looks)])
+    shapes, pictures = zip(*(look for of_face in looks for look in of_face))
+    scores = landmark_bias().features(np.stack(shapes))[0][:, TURN:]
+    portraits = np.stack([picture.ravel() for picture in pictures]).astype(np.float64)
     portraits = _of_norm_1(portraits - portraits.mean(axis=1, keepdims=True))
-    every, first = np.concatenate(scores), np.cumsum([0, *map(len, scores)])
     apart = np.zeros((len(faces), len(faces)))
     for row, (start, end) in enumerate(pairwise(first)):
         # Of vectors of norm 1 half of the squared distance is what their product lacks of 1.
         uncorrelated = cdist(portraits[start:end], portraits, "sqeuclidean") / 2
-        looks = cdist(every[start:end], every) / SHAPE_SCALE + uncorrelated / PORTRAIT_SCALE
-        apart[row] = np.minimum.reduceat(looks.min(axis=0), first[:-1])
+        distance = cdist(scores[start:end], scores) / SHAPE_SCALE + uncorrelated / PORTRAIT_SCALE
+        apart[row] = np.minimum.reduceat(distance.min(axis=0), first[:-1])
     return apart
 
 
@@ -316,15 +321,16 @@ def _persons(faces: list[Tracklet]) -> list[NDArray[np.int64]]:
 
     The most alike are joined first (single linkage): in two seconds a face shows but part of how it looks.
     """
-    if not faces:
-        return []
-    apart, number = differences(faces), np.arange(len(faces))
-    first, last = np.array([(face.frames[0], face.frames[-1]) for face in faces]).T
-    at_once = (first[:, None] <= last) & (first <= last[:, None])
-    pairs = np.argwhere(np.triu(apart < OTHER_PERSON, 1))
-    for one, other in pairs[np.argsort(apart[tuple(pairs.T)])]:
-        if number[one] != number[other]:
-            mine, theirs = number == number[one], number == number[other]
-            if not at_once[np.ix_(mine, theirs)].any():
-                number[theirs] = number[one]
+    number = np.arange(len(faces))
+    if len(faces) > 1:
+        apart = differences(faces)
+        first, last = np.array([(face.frames[0], face.frames[-1]) for face in faces]).T
+        # Of persons, each by the number of one of their faces.
+        at_once = (first[:, None] <= last) & (first <= last[:, None])
+        pairs = np.argwhere(np.triu(apart < OTHER_PERSON, 1))
+        for mine, theirs in (number[pair] for pair in pairs[np.argsort(apart[tuple(pairs.T)])]):
+            if mine != theirs and not at_once[mine, theirs]:
+                number[number == theirs] = mine
+                at_once[mine] |= at_once[theirs]
+                at_once[:, mine] |= at_once[:, theirs]
     return [np.flatnonzero(number == one) for one in np.unique(number)]

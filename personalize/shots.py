@@ -69,6 +69,11 @@ class Frames:
     segment: NDArray[np.int32]
     box: F32
 
+    @property
+    def seen(self) -> Bool:
+        """[T] frames that show the person, usable or not."""
+        return np.asarray(np.isfinite(self.box).all(axis=1))
+
 
 def thumbnail(rgb: U8) -> F32:
     """A picture [H, W, 3] as a grey one, 0 to 255, whose long side is THUMBNAIL px.

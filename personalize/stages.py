@@ -116,7 +116,7 @@ class CameraStage(Stage):
             files.read_landmarks(root / "landmarks/landmarks.npz"),
             files.read_features(root / "landmarks/features.npz"),
             run_head(context.settings),
-            frames.usable,
+            frames.seen,
             frames.segment,
             focal_given=context.settings.focal_px,
             distortion=context.settings.distortion,
@@ -238,7 +238,7 @@ class Judge(Stage):
 class Overlay(Stage):
     """The track over the video, to check by eye."""
 
-    name, version, reads = "overlay", 5, ("overlay",)
+    name, version, reads = "overlay", 6, ("overlay",)
     needs = (VIDEO, "landmarks/landmarks.npz", *JUDGED)
     makes, products = ("contact_sheet.png", "preview.mp4"), ("overlay.mp4",)
 

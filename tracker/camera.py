@@ -49,7 +49,7 @@ def estimate_camera(
     landmarks: Landmarks,
     features: FeatureTracks,
     head: HeadModel,
-    usable: NDArray[np.bool_],
+    seen: NDArray[np.bool_],
     segment: NDArray[np.int32],
     focal_given: float | None = None,
     distortion: tuple[float, ...] = (),
@@ -58,7 +58,7 @@ def estimate_camera(
 ) -> tuple[Camera, Bundle]:
     """The camera of one clip and the rigid evidence for it, in the frame of the mean head.
 
-    features: what was followed through the frames of the landmarks. usable: [T], frames that show the person. segment:
+    features: what was followed through the frames of the landmarks. seen: [T], frames that show the person. segment:
     [T], number of the uninterrupted shot. focal_given: px, of all frames; then nothing is estimated but poses and
     points. distortion: its radial coefficients, see `Lens`. recorded_mm: what the camera wrote of its focal length, on
     film 36 mm wide; 0 if nothing.
@@ -68,7 +68,7 @@ def estimate_camera(
         raise TrackError("a lens's distortion goes with its focal length: give both")
     prior = _camera(landmarks.size, focal_given, distortion, recorded_mm)
     if not focal_given:
-        prior = replace(prior, zoom=zoom_of_frames(landmarks, usable, segment, head))
+        prior = replace(prior, zoom=zoom_of_frames(landmarks, seen, segment, head))
     landmarks = landmarks.through(prior.lens)
     tracks = _not_aside(_straight(features, prior), landmarks)
     some = tracks.select(_telling(landmarks.points[tracks.frames]), MOST_POINTS)

@@ -58,7 +58,7 @@ def fit_track(
     usable: [T] bool, frames that may be measured. segment: [T], number of the uninterrupted shot;
     smoothness never crosses from one to another.
     evidence: [T] 0..1, how far each frame's landmarks are followed, less where something covers the face: below one
-    half they tell nothing of the identity, and the frames around them tell the pose.
+    half they tell nothing of the identity, unless few are above, and the frames around them tell the pose.
     Raises TrackError when no frame can be measured.
     """
     weights = Weights()
@@ -85,7 +85,8 @@ def _share(evidence: F32 | None, good: Frames) -> F64:
 def trusted(evidence: F32 | None, good: Frames) -> Frames:
     """Rows of the frames `good` [n] that tell something on their own, see `fit_track`; of the best if few do."""
     share = _share(evidence, good)
-    return np.flatnonzero(share >= min(0.5, np.sort(share)[-min(FEW, len(share))]))
+    few = np.sort(share)[-min(FEW, len(share))]
+    return np.flatnonzero(share >= min(0.5, max(few, share.max() / 2)))
 
 
 def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.bool_]) -> Frames:

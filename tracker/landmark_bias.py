@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tracker.energy import LID_PAIRS, LIP_PAIRS
+from tracker.energy import LID_PAIRS, LIP_PAIRS, TOGETHER
 from tracker.similarity import similarity
 from tracker.track import F32, F64
 
@@ -29,7 +29,6 @@ USUAL_TURN = 0.1
 # What two lips or lids err by apart from each other counts in full from this opening on, and the less the narrower it
 # is read: not at all where they touch, so that shut ones stay as far apart as the clip's others.
 OPEN_M = 0.004
-TOGETHER = 1000  # frames, to bound memory
 
 
 @dataclass(frozen=True)

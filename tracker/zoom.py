@@ -23,16 +23,16 @@ ENLARGED, QUICK_S = 0.14, 0.5
 
 
 def zoom_of_frames(
-    landmarks: Landmarks, usable: NDArray[np.bool_], segment: NDArray[np.int32], head: HeadModel
+    landmarks: Landmarks, seen: NDArray[np.bool_], segment: NDArray[np.int32], head: HeadModel
 ) -> F32:
     """[T, 3] times that each frame's picture is enlarged, and x, y px of the place that stays; [0, 3] if none is.
 
-    usable: [T], frames that show the person. segment: [T], number of the uninterrupted shot. Nothing in a face tells a
-    longer lens from a shorter way, so where it is larger or smaller than in most frames it is taken to be as far away
-    as there. What stays is the picture's middle, of editors as of lenses, or the face's where a smaller one would come
-    to lie beyond the picture's edge.
+    seen: [T], frames that show the person, usable or not. segment: [T], number of the uninterrupted shot. Nothing in a
+    face tells a longer lens from a shorter way, so where it is larger or smaller than in most frames it is taken to be
+    as far away as there. What stays is the picture's middle, of editors as of lenses, or the face's where a smaller one
+    would come to lie beyond the picture's edge.
     """
-    size = _sizes(landmarks, usable, head)
+    size = _sizes(landmarks, seen, head)
     known = np.flatnonzero(np.isfinite(size))
     if not len(known):
         return never()
@@ -52,18 +52,18 @@ def zoom_of_frames(
     return zoom.astype(np.float32) if enlarged.any() else never()
 
 
-def _sizes(landmarks: Landmarks, usable: NDArray[np.bool_], head: HeadModel) -> F64:
+def _sizes(landmarks: Landmarks, seen: NDArray[np.bool_], head: HeadModel) -> F64:
     """[T] logarithms of px per metre of the person's upper face; NaN unseen, or turned far aside."""
     embedding = head.landmark_embedding
     rigid = of_rigid_face(embedding.landmarks)
     nothing = np.zeros(len(head.identity_basis)), np.zeros(len(head.expression_basis))
     mean = head.landmark_positions(*nothing)[rigid].astype(np.float64)
     size = np.full(len(landmarks.time), np.nan)
-    seen = np.flatnonzero(usable & np.isfinite(landmarks.points).all((1, 2)))
-    if len(seen):
-        seen = seen[turned_as_usual(landmarks.points[seen])]
-        points = landmarks.points[seen][:, embedding.landmarks[rigid]].astype(np.float64)
-        size[seen] = np.log(similarity(mean, points)[0])
+    known = np.flatnonzero(seen & np.isfinite(landmarks.points).all((1, 2)))
+    if len(known):
+        known = known[turned_as_usual(landmarks.points[known])]
+        points = landmarks.points[known][:, embedding.landmarks[rigid]].astype(np.float64)
+        size[known] = np.log(similarity(mean, points)[0])
     return size
 
 

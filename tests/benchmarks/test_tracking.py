@@ -1,10 +1,14 @@
 """The command: one clip by name, and a name that is none."""
 
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks import tracking
+from personalize.pictures import FrameReader
+from tests.personalize.video_factory import moving, write_video
 
 
 def test_one_clip_by_name(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -29,6 +33,24 @@ def test_any_stranger_may_be_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["tracking", "stranger1234"])
     tracking.main()
     assert asked == [{"stranger1234"}]
+
+
+def test_films_are_enlarged_if_asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    changed: list[float] = []
+    video = write_video(tmp_path / "v.mp4", moving(1) * 100, [k / 25 for k in range(100)])
+
+    def look(video: Path, *_: object) -> None:
+        first, last = (rgb.astype(int) for _, rgb in list(FrameReader(video))[::99])
+        changed.append(float(np.abs(last - first).mean()))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tracking, "compile_ahead", lambda head: None)
+    monkeypatch.setattr(tracking, "watched", look)
+    for more in ([], ["--enlarged"]):
+        monkeypatch.setattr(sys, "argv", ["tracking", str(video), *more])
+        with pytest.raises(KeyboardInterrupt):
+            tracking.main()
+    assert changed[0] < 1 and changed[1] > 5
 
 
 def test_unknown_clip_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -277,7 +277,8 @@ def test_what_the_file_lost_is_said(tmp_path: Path) -> None:
     path = write_video(tmp_path / "gap.mkv", moving(20), [i / 25 + (i >= 10) for i in range(20)])
     _, warnings = find_usable(probe(path))
     assert any(
-        "1.0 s without pictures, in a gap at 0.4 s: each counts as a cut; export" in text for text in warnings
+        "1.0 s without pictures, in a gap at 0.4 s: the film counts as cut there; export" in text
+        for text in warnings
     )
 
 
@@ -331,6 +332,7 @@ def test_every_frame_is_left_out_for_its_reason(monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_array_equal(
         np.isnan(frames.box[:, 0]), np.isin(np.arange(100), [*range(26, 36), *range(80, 100)])
     )
+    np.testing.assert_array_equal(frames.seen, ~np.isnan(frames.box[:, 0]))
     assert any("2.0% of 100 frames left out: damaged" in text for text in warnings)  # however few
     assert any("20.0% of 100 frames left out: another person" in text for text in warnings)
     assert set(DESCRIPTIONS) == set(REMEDIES) == set(REASONS[1:])

@@ -274,7 +274,7 @@ def test_people_are_told_apart_by_the_shape_of_the_face_and_by_how_the_head_look
     paler = shot(range(40, 70), (0, 5, 10))
     tilt = np.array([[0.0, -1.3, 0.0], [1.3, 0.0, 0.0], [0.0, 0.0, 1.3]])
     paler.sightings = [
-        (seen.sample and replace(seen, sample=(seen.sample[0] @ tilt, seen.sample[1] // 2))) or seen
+        (seen.sample and replace(seen, sample=(seen.sample[0] @ tilt, seen.sample[1] // 2 + 60))) or seen
         for seen in paler.sightings
     ]
     shape, hair = shot(range(80, 110), (0, 5), person=1), shot(range(120, 150), (0, 5), hair=1)

@@ -49,6 +49,8 @@ def test_the_stages_that_use_them_depend_on_their_content(base: Path) -> None:
     embedded, own = Settings(), Settings(base=str(base), encoder="mine")
     changed = {stage.name for stage in STAGES if stage.assets(embedded) != stage.assets(own)}
     assert changed == {"registration", "finetune", "evaluate"}
+    faces = {"face_landmarker", "landmark_bias"}
+    assert {stage.name for stage in STAGES if faces <= set(stage.assets(own))} == {"ingest", "landmarks"}
     copy = base.with_name("copy.safetensors")
     copy.write_bytes(base.read_bytes())
     same = Settings(base=str(copy), encoder="mine")

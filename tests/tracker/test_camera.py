@@ -221,8 +221,10 @@ def test_shots_that_are_enlarged_are_put_back(head: HeadModel) -> None:
     (as_filmed, straight), (camera, bundle) = (
         subject.estimate_camera(*clip, head, everywhere, shots) for clip in ((marks, tracks), shown)
     )
+    unseen, _ = subject.estimate_camera(*shown, head, times == 1, shots)
     given, _ = subject.estimate_camera(*shown, head, everywhere, shots, focal_given=FOCAL)
     assert not len(as_filmed.zoom) and not len(given.zoom)
+    assert not len(unseen.zoom), "other people"
     np.testing.assert_allclose(camera.zoom[:, 0], times, rtol=0.05)
     assert camera.focal_px == pytest.approx(as_filmed.focal_px, rel=0.05)
     between = Rotation.from_rotvec(straight.rotation).inv() * Rotation.from_rotvec(bundle.rotation)

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import tracker.energy
 from tests.flame_factory import FakeFlame
 from tests.tracker.test_flame import arrays, surface
 from tracker.energy import (
@@ -181,6 +182,14 @@ def test_skin_turned_away_counts_little():
     assert (seen[0] == 1).all()
     assert (seen[1] == seen[1].min()).all()
     assert 0 < seen[1].min() < 0.1
+
+
+def test_skin_is_seen_alike_however_many_frames_are_asked_at_once(monkeypatch: pytest.MonkeyPatch):
+    random = np.random.default_rng(0)
+    poses = random.normal(0, 1, (20, 3)), random.normal((0, 0, 1), 0.1, (20, 3))
+    whole = visibility(model := random_model(), *poses)
+    monkeypatch.setattr(tracker.energy, "TOGETHER", 7)
+    np.testing.assert_array_equal(visibility(model, *poses), whole)
 
 
 def test_the_energy_is_the_sum_of_its_parts():

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tracker import solver
 from tracker.energy import LIP_PAIRS, Weights, landmark_model
-from tracker.fit import fit_track, make_track, resume, runs, with_lips_shut
+from tracker.fit import fit_track, make_track, resume, runs, trusted, with_lips_shut
 from tracker.head import load_head
 from tracker.landmark_indices import BLENDSHAPE_NAMES, INNER_LIP_LOWER, POINTS
 from tracker.modes import LIP_SHAPES
@@ -367,6 +367,20 @@ def test_smoothness_does_not_cross_a_cut():
     assert jump(cut.translation[40] - cut.translation[39]) > 0.07
     assert cut.reprojection_px[38:42].mean() < through.reprojection_px[38:42].mean()
     assert cut.reprojection_px[38:42].mean() < 1.3 * cut.reprojection_px.mean()
+
+
+@pytest.mark.parametrize(
+    ("evidence", "rows"),
+    [
+        ([1.0] * 10 + [0.0] * 90, range(10)),  # covered ones tell nothing, however few are bare
+        ([0.9] * 30 + [0.4] * 70, range(30)),
+        ([0.55] * 2 + [0.45] * 30 + [0.1] * 68, range(32)),  # hardly any is sure
+        ([0.45] * 50 + [0.3] * 50, range(50)),
+    ],
+)
+def test_frames_that_are_bare_are_trusted_or_the_barest(evidence: list[float], rows: range):
+    np.testing.assert_array_equal(trusted(np.array(evidence, np.float32), np.arange(100)), rows)
+    assert len(trusted(None, np.arange(5))) == 5
 
 
 def test_a_frame_with_wild_landmarks_is_not_trusted(talker):

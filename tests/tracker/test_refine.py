@@ -424,10 +424,10 @@ def test_stretches_cover_every_frame_once(total: int, overlap: int):
 
 @pytest.mark.parametrize("there", [119, 120, 121, 126, 128, 246])
 def test_what_a_film_that_breaks_off_shows_is_in_a_stretch(there: int):
-    pictures = ((row, np.zeros(0, np.uint8)) for row in range(there))
-    covered = [
-        row for start, held in _stretches(pictures, 1000, 8) for row in held if start <= row < start + 120
-    ]
+    pictures, covered = ((row, np.zeros(0, np.uint8)) for row in range(there)), []
+    for start, held in _stretches(pictures, 1000, 8):
+        assert min(held) == max(0, start - 8)
+        covered += [row for row in held if start <= row < start + 120]
     assert covered == list(range(there))
 
 

@@ -34,9 +34,9 @@ def enlarged(landmarks: Landmarks, times: np.ndarray, about: np.ndarray = MIDDLE
     return replace(landmarks, points=points)
 
 
-def zoom_of_frames(landmarks: Landmarks, segment: np.ndarray, usable: np.ndarray | None = None) -> F32:
-    usable = np.ones(len(segment), bool) if usable is None else usable
-    return subject.zoom_of_frames(landmarks, usable, segment, HEAD)
+def zoom_of_frames(landmarks: Landmarks, segment: np.ndarray, seen: np.ndarray | None = None) -> F32:
+    seen = np.ones(len(segment), bool) if seen is None else seen
+    return subject.zoom_of_frames(landmarks, seen, segment, HEAD)
 
 
 def test_shots_that_are_enlarged_are_told_from_people_who_lean_forward(talker: Talker) -> None:
