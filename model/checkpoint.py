@@ -164,7 +164,7 @@ class Checkpoint:
             raise ModelError(f"{path} is not a checkpoint of schema {SCHEMA} (it has {found}); make it again")
         try:
             checkpoint = _assemble(tensors, metadata)
-        except (KeyError, ValueError, TypeError, RuntimeError) as error:
+        except (KeyError, ValueError, TypeError, RuntimeError, ZeroDivisionError) as error:
             reason = " ".join(str(error).split())[:120]
             raise ModelError(
                 f"{path} is damaged or incomplete as a checkpoint ({reason}); make it again"

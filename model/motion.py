@@ -147,10 +147,12 @@ def principal_modes(displacements: NDArray[np.float32]) -> tuple[NDArray[np.floa
 
 def _check_shapes(motion: Motion, path: Path) -> None:
     """MotionError naming the array whose shape does not fit the others, or that holds nothing."""
-    vertices, modes, frames = len(motion.template), len(motion.basis), len(motion.coefficients)
+    vertices, modes, frames, faces = (
+        len(np.atleast_1d(getattr(motion, name))) for name in ("template", "basis", "coefficients", "faces")
+    )
     expected = {
         "template": (vertices, 3),
-        "faces": (len(motion.faces), 3),
+        "faces": (faces, 3),
         "basis": (modes, vertices, 3),
         "coefficients": (frames, modes),
         "valid": (frames,),

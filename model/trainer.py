@@ -190,10 +190,11 @@ class Trainer:
         return self.folder / f"candidate_{step:08d}.safetensors"
 
     def _settings(self) -> str:
-        """What must agree for a continuation to be the same training: all but where it is saved, logged,
-        run.
+        """What must agree for a continuation to be the same training: all but where it is saved, logged, run.
+
+        Of several cards each process has its own.
         """
-        settings = asdict(self.config)
+        settings = asdict(self.config) | {"device": torch.device(self.config.device).type}
         for name in ("threads", "save_seconds", "log_every"):
             del settings[name]
         settings |= {"architecture": self._checkpoint.config.architecture, "begun_with": self._begun_with}

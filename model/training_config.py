@@ -69,6 +69,7 @@ def available_device(name: str) -> torch.device:
         device = torch.device(name)
     except RuntimeError:
         raise ModelError(f"device {name!r} is not known; use cpu or cuda") from None
-    if device.type not in ("cpu", "cuda") or (device.type == "cuda" and not torch.cuda.is_available()):
+    cards = torch.cuda.device_count() if device.type == "cuda" and torch.cuda.is_available() else 0
+    if device.type != "cpu" and (device.index or 0) >= cards:
         raise ModelError(f"device {name!r} is not there; use cpu")
     return device

@@ -49,15 +49,19 @@ def animate_speech(
     that cannot be used, and for an output that cannot be written.
     """
     places = output_places(out or Path(f"{speech.stem}.animation"), samples, [speech])
-    path, checkpoint, speech_encoder = load_subject(subject, encoder)
+    hearing = speech_encoder(encoder)
+    path, checkpoint = load_subject(subject, hearing)
     sound, start_s = read_speech(speech)
     frames = max(1, round((start_s + len(sound) / FILM_RATE) * FPS))
-    features = speech_features(speech, np.arange(frames) / FPS, speech_encoder)
     s = checkpoint.guidance if guidance is None else guidance
-    with report.stage("synthesis"):
-        motions = synthesize(
-            checkpoint, features, guidance=s, samples=samples, seed=seed, progress=report.progress
-        )
+    try:
+        features = speech_features(speech, np.arange(frames) / FPS, hearing)
+        with report.stage("synthesis"):
+            motions = synthesize(
+                checkpoint, features, guidance=s, samples=samples, seed=seed, progress=report.progress
+            )
+    except ModelError as error:
+        raise UserError(f"{speech}: {error}") from error
     audio = on_video_clock(sound, start_s, frames / FPS, FILM_RATE)
     for index, (place, coefficients) in enumerate(zip(places, motions)):
         motion = Motion(
@@ -83,10 +87,18 @@ def animate_speech(
         yield from write_sample(place, motion, checkpoint.regions["face"], audio, report)
 
 
-def load_subject(subject: Path, encoder: str | None) -> tuple[Path, Checkpoint, SpeechEncoder]:
-    """A run folder or a checkpoint file -> where the checkpoint lies, itself, and the speech encoder that it needs.
+def speech_encoder(source: str | None) -> SpeechEncoder:
+    """The encoder in a folder or of a hub name, None: the embedded one. Raises UserError for another thing."""
+    try:
+        return load_encoder(source)
+    except ModelError as error:
+        raise UserError(str(error)) from error
 
-    Raises UserError for another thing, or where `encoder` (None: the embedded one) is not the one it needs.
+
+def load_subject(subject: Path, encoder: SpeechEncoder | None) -> tuple[Path, Checkpoint]:
+    """A run folder or a checkpoint file -> where the checkpoint lies, and itself.
+
+    Raises UserError for another thing, or where `encoder` is not the one it needs; None where nothing is heard.
     """
     path = subject / "checkpoint.safetensors" if subject.is_dir() else subject
     if not path.is_file():
@@ -94,8 +106,7 @@ def load_subject(subject: Path, encoder: str | None) -> tuple[Path, Checkpoint, 
             f"{subject}: no checkpoint there; give a finished run folder or a checkpoint.safetensors"
         )
     try:
-        speech_encoder = load_encoder(encoder)
-        return path, Checkpoint.load(path, encoder=speech_encoder.name), speech_encoder
+        return path, Checkpoint.load(path, encoder=None if encoder is None else encoder.name)
     except ModelError as error:
         raise UserError(str(error)) from error
 

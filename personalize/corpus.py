@@ -56,6 +56,10 @@ class Corpus:
         """One sentence at 30 fps, as long as both its motion and its sound."""
         displacements, audio = self.data.displacements(name, sentence), self.data.audio(name, sentence)
         frames = min(len(displacements), int(len(audio) * FPS / SPEECH_RATE))
+        if frames < 1:
+            raise UserError(
+                f"{self.data.folder}: {name}, sentence {sentence}, has no sound or no motion; get the data again"
+            )
         coefficients = self.motion.coefficients(displacements[:frames])
         return Sequence(coefficients, speech_at(audio, frames, self.encoder), np.ones(frames, bool), style)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from trimesh.registration import procrustes
 
+from model.motion import DAMAGED
 from personalize.errors import UserError
 from personalize.files import write_json
 from personalize.pipeline import personalize_video
@@ -64,7 +64,7 @@ def run_demo(out: Path, iterations: int, seed: int) -> dict[str, float]:
 def _is_truth(path: Path) -> bool:
     try:
         Truth.load(path)
-    except (OSError, EOFError, ValueError, KeyError, BadZipFile):
+    except (KeyError, *DAMAGED):
         return False
     return True
 

@@ -16,7 +16,7 @@ from model.editing import Kept, check_motion, edit, seam_of, with_frames
 from model.errors import ModelError
 from model.motion import Motion, MotionError
 from model.speech import SpeechEncoder
-from personalize.animation import load_subject, output_places, read_speech, write_sample
+from personalize.animation import load_subject, output_places, read_speech, speech_encoder, write_sample
 from personalize.errors import UserError
 from personalize.files import sha256_file
 from personalize.regions import kept_share
@@ -67,17 +67,19 @@ def edit_motion(
     places = output_places(
         out or Path(f"{path.stem}.edit"), settings.samples, [path, settings.source, speech]
     )
-    checkpoint_path, checkpoint, encoder = load_subject(subject, settings.encoder)
+    heard = speech is not None and not settings.unconditional
+    encoder = speech_encoder(settings.encoder) if heard else None
+    checkpoint_path, checkpoint = load_subject(subject, encoder)
     motion = _load_motion(path)
     try:
         check_motion(checkpoint, motion)
         sound, features = (None, None) if speech is None else _sound_of(speech, motion, encoder, report)
-        guidance = _guidance(settings, checkpoint, heard=features is not None)
+        guidance = _guidance(settings, checkpoint, heard)
         kept = _kept(motion, checkpoint, settings)
         with report.stage("synthesis"):
             edited = edit(
                 checkpoint,
-                None if settings.unconditional else features,
+                features,
                 kept,
                 guidance=guidance,
                 samples=settings.samples,
@@ -110,7 +112,7 @@ def edit_motion(
 
 def _guidance(settings: EditSettings, checkpoint: Checkpoint, heard: bool) -> float:
     """The s that is used; UserError where one is asked for and there is nothing to be guided by."""
-    if heard and not settings.unconditional:
+    if heard:
         return checkpoint.guidance if settings.guidance is None else settings.guidance
     if settings.guidance is not None:
         raise UserError("--guidance: needs --audio, and no --unconditional; leave it out")
@@ -155,8 +157,13 @@ def _with_keyframes(motion: Motion, source: Path, keyframes: NDArray[np.bool_]) 
     return with_frames(motion, other, keyframes, places)
 
 
-def _sound_of(speech: Path, motion: Motion, encoder: SpeechEncoder, report: Reporter) -> tuple[F32, F32]:
-    """Sound [S] at 48 kHz from the motion's first frame on, and the speech features [N, W] of its frames."""
+def _sound_of(
+    speech: Path, motion: Motion, encoder: SpeechEncoder | None, report: Reporter
+) -> tuple[F32, F32 | None]:
+    """Sound [S] at 48 kHz from the motion's first frame on, and the speech features [N, W] of its frames.
+
+    No features without an encoder.
+    """
     times = motion.start_s + np.arange(len(motion.valid)) / motion.fps
     sound, start_s = read_speech(speech, times[-1])
     offset_s = motion.sound_offset_s(sha256_file(speech))
@@ -164,7 +171,7 @@ def _sound_of(speech: Path, motion: Motion, encoder: SpeechEncoder, report: Repo
     if not offset_s and motion.provenance.get("av_offset_s"):
         report.say(f"{speech}: not the sound on which the motion's offset was found, which is not applied")
     length_s = len(times) / motion.fps
-    features = speech_features(speech, times, encoder)
+    features = None if encoder is None else speech_features(speech, times, encoder)
     return on_video_clock(sound, start_s - times[0], length_s, FILM_RATE), features
 
 

@@ -114,6 +114,8 @@ class TrainingFiles(Vocaset):
             if min(rows) < 0 or frames[-1] > 2 * len(rows):
                 raise IndexError("rows below 0, or most frames missing")
             vertices = np.asarray(self._vertices[rows], np.float32).reshape(len(rows), -1)
+            if not np.isfinite(vertices).all():
+                raise ValueError("vertices that are not finite")
         except (LookupError, TypeError, ValueError) as error:
             raise UserError(
                 f"{self.folder / 'subj_seq_to_idx.pkl'}: the rows of {subject}, sentence {sentence}, do not fit"
@@ -161,6 +163,10 @@ class SequenceFiles(Vocaset):
         """See Vocaset."""
         vertices = _mapped(self._files[subject][sentence], (None, 3 * self.vertex_count))
         taken = np.asarray(vertices[::STRIDE], np.float32)
+        if not np.isfinite(taken).all():
+            raise UserError(
+                f"{self._files[subject][sentence]}: holds vertices that are not finite; get it again"
+            )
         return taken.reshape(len(taken), -1, 3) - self.templates[subject]
 
     def audio(self, subject: str, sentence: int) -> F32:

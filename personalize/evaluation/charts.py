@@ -39,7 +39,9 @@ def timeline(time: NDArray[np.floating], confidence: NDArray[np.floating], valid
     """Confidence over the clip; frames left out are shaded."""
     figure, axes = _axes(height=1.8)
     axes.plot(time, np.where(valid, confidence, np.nan), color=BLUE, lw=0.8)
-    axes.fill_between(time, 0, 1, where=~valid, color=RED, alpha=0.25, lw=0, label="left out")
+    edges = np.append(time, time[-1] + (np.median(np.diff(time)) if len(time) > 1 else 0.0))
+    first, end = edges[np.flatnonzero(np.diff(~valid, prepend=False, append=False))].reshape(-1, 2).T
+    axes.broken_barh(list(zip(first, end - first)), (0, 1), color=RED, alpha=0.25, lw=0, label="left out")
     axes.set(ylim=(0, 1.02), xlim=(time[0], time[-1]), xlabel="s", ylabel="confidence")
     if not valid.all():
         axes.legend(loc="lower right", frameon=False)

@@ -88,6 +88,8 @@ def test_missing_arrays(path: Path, missing: str) -> None:
         ({"coefficients": np.zeros((40, 9))}, "coefficients has shape"),
         ({"valid": np.ones(39, bool)}, "valid has shape"),
         ({"template": np.zeros((talker.D, 2))}, "template has shape"),
+        ({"template": np.array(1.0)}, "template has shape"),
+        ({"faces": np.array(1)}, "faces has shape"),
         ({"template": np.zeros((talker.D + 1, 3))}, "shape"),
         ({"faces": np.full((5, 3), talker.D)}, "vertices that do not exist"),
         ({"faces": np.full((5, 3), -1)}, "vertices that do not exist"),

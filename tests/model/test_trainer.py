@@ -115,6 +115,7 @@ def test_a_state_of_another_training_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="other settings, data or start"):
         Trainer(talker.checkpoint(sequences, architecture="transformer"), sequences, tmp_path, TINY)
     Trainer(checkpoint, sequences, tmp_path, replace(TINY, threads=2, log_every=7))  # changes no result
+    Trainer(checkpoint, sequences, tmp_path, replace(TINY, device="cpu:0"))  # one of several
     (tmp_path / STATE_FILE).write_bytes(b"half")
     with pytest.raises(ModelError, match="not a readable"):
         Trainer(checkpoint, sequences, tmp_path, TINY)

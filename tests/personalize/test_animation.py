@@ -8,6 +8,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from model.errors import ModelError
 from model.motion import Motion
 from personalize import animation
 from personalize.animation import animate_speech
@@ -71,6 +72,16 @@ def test_a_checkpoint_of_another_encoder_says_which_and_how(
         animate(speech, subject, tmp_path / "out", samples=1)
     assert "wav2vec2#layer=12@0123" in str(caught.value) and "\n" not in str(caught.value)
     assert encoder.calls == 0 and not (tmp_path / "out").exists()
+
+
+def test_an_encoder_that_fails_on_the_sound_is_the_users_to_mend(
+    encoder: CountingEncoder, speech: Path, subject: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        encoder, "encode", Mock(side_effect=ModelError("its weights are damaged")), raising=False
+    )
+    with pytest.raises(UserError, match=r"speech\.wav: its weights are damaged"):
+        animate(speech, subject, tmp_path / "out", samples=1)
 
 
 def test_an_output_that_cannot_be_written_is_refused_before_anything_is_made(

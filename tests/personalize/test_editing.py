@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from model.checkpoint import Checkpoint
+from model.errors import ModelError
 from model.motion import Motion
 from model.speech import load_encoder
 from model.synthesis import synthesize
@@ -94,8 +96,10 @@ def test_frames_and_regions_are_kept_and_films_have_sound(
 
 
 def test_without_audio_the_edit_is_unconditional_and_silent(
-    motion: Path, speech: Path, tmp_path: Path
+    motion: Path, speech: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """And needs no speech encoder."""
+    monkeypatch.setattr(animation, "load_encoder", Mock(side_effect=ModelError("no such encoder")))
     silent = run(motion, None, tmp_path / "silent", keep=":10%,90%:")
     played = run(motion, speech, tmp_path / "played", keep=":10%,90%:", unconditional=True)
     a, b = (Motion.load(paths[0]) for paths in (silent, played))

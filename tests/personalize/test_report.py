@@ -1,7 +1,10 @@
 """What the report says."""
 
+import numpy as np
 import pytest
+from matplotlib.axes import Axes
 
+from personalize.evaluation import charts
 from personalize.evaluation.report import _sound_offset
 
 
@@ -19,3 +22,11 @@ def test_a_small_offset_of_the_sound_is_told_from_an_unsure_one(
     found_s: float, sure: bool, says: str
 ) -> None:
     assert _sound_offset({"av_offset_estimate_s": found_s, "av_offset_sure": sure}) == says
+
+
+def test_single_frames_that_are_left_out_are_shaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    shaded: list[tuple[float, float]] = []
+    monkeypatch.setattr(Axes, "broken_barh", lambda self, spans, *_, **__: shaded.extend(spans))
+    used = np.array([False, True, True, False, True, True, False, False])
+    charts.timeline(np.arange(8) / 25, np.ones(8), used)
+    np.testing.assert_allclose(shaded, [(0, 0.04), (0.12, 0.04), (0.24, 0.08)], atol=1e-9)

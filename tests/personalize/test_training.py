@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from model.synthesis import synthesize
 from model.trainer import TrainingDivergedError
 from model.training_config import TrainingConfig
 from personalize import protocol
+from personalize.corpus import Corpus
 from personalize.errors import UserError
 from personalize.files import sha256_file
 from personalize.mouth import mouth_regions
@@ -204,6 +206,13 @@ def test_what_is_learned_from_and_what_is_no_checkpoint_is_not_written_over(
         with pytest.raises(UserError, match=says):
             train(out, motions=folder, iterations=4)
     assert {path: path.read_bytes() for path in (*folder.iterdir(), note)} == before
+
+
+def test_a_sentence_without_sound_is_named() -> None:
+    data = Mock(folder=Path("vocaset"), displacements=Mock(return_value=np.zeros((30, 5, 3))))
+    data.audio.return_value = np.zeros(100, np.float32)  # 6 ms
+    with pytest.raises(UserError, match=f"vocaset: {TRAIN[0]}, sentence 7, has no sound or no motion"):
+        Corpus(data, Mock(), Mock())._sequence(TRAIN[0], 7, 0)
 
 
 def test_a_motions_sound_is_as_late_as_its_run_found_it(fake: FakeVocaset, tmp_path: Path) -> None:

@@ -122,6 +122,17 @@ def test_layouts_are_told_apart_and_other_folders_refused(tmp_path: Path) -> Non
         open_vocaset(tmp_path / "empty")
 
 
+def test_vertices_of_a_sentences_file_that_are_not_finite_are_named(tmp_path: Path) -> None:
+    fake = FakeVocaset({TRAIN[0]: [1]}, frames=10)
+    folder = fake.write_sequence_files(tmp_path / "vocaset")
+    file = folder / "vertices_npy" / f"{TRAIN[0]}_sentence01.npy"
+    vertices = np.load(file)
+    vertices[4, 5] = np.inf
+    np.save(file, vertices)
+    with pytest.raises(UserError, match=r"sentence01\.npy: holds vertices that are not finite"):
+        open_vocaset(folder).displacements(TRAIN[0], 1)
+
+
 def overwritten(folder: Path, name: str, value: Any) -> Path:
     if name.endswith(".npy"):
         np.save(folder / name, value)
@@ -139,6 +150,7 @@ def overwritten(folder: Path, name: str, value: Any) -> Path:
         ("templates.pkl", {"a": np.zeros((5, 3)), "b": np.zeros((6, 3))}, "different numbers"),
         ("data_verts.npy", np.zeros((10, 7, 3)), "fit templates.pkl"),
         ("data_verts.npy", np.zeros((10, 182, 3), int), "floats"),
+        ("data_verts.npy", np.full((10, 182, 3), np.nan, np.float32), "finite"),
         ("subj_seq_to_idx.pkl", {TRAIN[0]: [1]}, "subject: {sequence"),
         ("subj_seq_to_idx.pkl", {TRAIN[0]: {"sentence01": {0: 10_000}}}, "do not fit"),
         ("subj_seq_to_idx.pkl", {TRAIN[0]: {"sentence01": {0: -1}}}, "do not fit"),
