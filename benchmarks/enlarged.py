@@ -1,4 +1,4 @@
-"""A film as an editor leaves it: every other shot larger, about the picture's middle."""
+"""A film as editors leave it: two of every five seconds larger, about the picture's middle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from personalize.video_writer import VideoWriter
 
 U8 = NDArray[np.uint8]
 
-PLAIN_S, LARGER_S, LARGER = 3.0, 2.0, 1.3  # how long shots are, and how many times larger every other one is
+PLAIN_S, LARGER_S, LARGER = 3.0, 2.0, 1.3  # by turns, and how many times larger
 CRF = 12  # x264's: next to nothing is lost
 
 
@@ -32,7 +32,7 @@ def by_turns(rgb: U8, time: float) -> U8:
 
 @contextmanager
 def enlarged(video: Path) -> Iterator[Path]:
-    """The video with every other shot enlarged, without sound; the file is gone afterwards."""
+    """The video, enlarged by turns and without sound; the file is gone afterwards."""
     info = probe(video)
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / video.name

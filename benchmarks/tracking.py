@@ -182,7 +182,7 @@ def ground_truths(
 ) -> Iterator[tuple[str, str, Clip, GroundTruth]]:
     """(group, name, clip, truth) of every clip, or of the chosen ones.
 
-    lens: whether cameras wrote theirs down. larger: whether every other shot is enlarged.
+    lens: whether cameras wrote theirs down. larger: whether two of five seconds are enlarged.
     """
     for seed in range(PERSONS):
         if wanted(f"person{seed}", chosen):
@@ -204,7 +204,7 @@ def ground_truths(
 
 
 def edited(video: Path, larger: bool) -> AbstractContextManager[Path]:
-    """The video, or one with every other shot enlarged."""
+    """The video, or one of which two of five seconds are enlarged."""
     return enlarged(video) if larger else nullcontext(video)
 
 
@@ -258,7 +258,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("clips", nargs="*", metavar="NAME | VIDEO")
     parser.add_argument("--lens", action="store_true", help="cameras wrote their focal lengths down")
-    parser.add_argument("--enlarged", action="store_true", help="every other shot is enlarged")
+    parser.add_argument(
+        "--enlarged", action="store_true", help="two of five seconds of every film are enlarged"
+    )
     options = parser.parse_args()
     named = options.clips
     videos = [Path(name) for name in named if Path(name).suffix]

@@ -186,7 +186,7 @@ class Checkpoint:
 
 
 def _assemble(tensors: dict[str, Tensor], metadata: dict[str, str]) -> Checkpoint:
-    """The checkpoint of a file's content; KeyError, ValueError, TypeError or RuntimeError where it does
+    """The checkpoint of a file's content; KeyError, ValueError, TypeError, RuntimeError or ZeroDivisionError if it does
     not fit.
     """
 

@@ -71,5 +71,5 @@ def available_device(name: str) -> torch.device:
         raise ModelError(f"device {name!r} is not known; use cpu or cuda") from None
     cards = torch.cuda.device_count() if device.type == "cuda" and torch.cuda.is_available() else 0
     if device.type != "cpu" and (device.index or 0) >= cards:
-        raise ModelError(f"device {name!r} is not there; use cpu")
+        raise ModelError(f"device {name!r} is not there; use cpu{' or cuda' if cards else ''}")
     return device

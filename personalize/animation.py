@@ -49,8 +49,9 @@ def animate_speech(
     that cannot be used, and for an output that cannot be written.
     """
     places = output_places(out or Path(f"{speech.stem}.animation"), samples, [speech])
+    path = checkpoint_of(subject)
     hearing = speech_encoder(encoder)
-    path, checkpoint = load_subject(subject, hearing)
+    checkpoint = load_checkpoint(path, hearing)
     sound, start_s = read_speech(speech)
     frames = max(1, round((start_s + len(sound) / FILM_RATE) * FPS))
     s = checkpoint.guidance if guidance is None else guidance
@@ -95,18 +96,20 @@ def speech_encoder(source: str | None) -> SpeechEncoder:
         raise UserError(str(error)) from error
 
 
-def load_subject(subject: Path, encoder: SpeechEncoder | None) -> tuple[Path, Checkpoint]:
-    """A run folder or a checkpoint file -> where the checkpoint lies, and itself.
-
-    Raises UserError for another thing, or where `encoder` is not the one it needs; None where nothing is heard.
-    """
+def checkpoint_of(subject: Path) -> Path:
+    """Where the checkpoint of a run folder lies, or the file itself. Raises UserError where there is none."""
     path = subject / "checkpoint.safetensors" if subject.is_dir() else subject
     if not path.is_file():
         raise UserError(
             f"{subject}: no checkpoint there; give a finished run folder or a checkpoint.safetensors"
         )
+    return path
+
+
+def load_checkpoint(path: Path, encoder: SpeechEncoder | None) -> Checkpoint:
+    """A subject. encoder: None where nothing is heard. Raises UserError for another thing, or another encoder's."""
     try:
-        return path, Checkpoint.load(path, encoder=None if encoder is None else encoder.name)
+        return Checkpoint.load(path, encoder=None if encoder is None else encoder.name)
     except ModelError as error:
         raise UserError(str(error)) from error
 

@@ -16,7 +16,14 @@ from model.editing import Kept, check_motion, edit, seam_of, with_frames
 from model.errors import ModelError
 from model.motion import Motion, MotionError
 from model.speech import SpeechEncoder
-from personalize.animation import load_subject, output_places, read_speech, speech_encoder, write_sample
+from personalize.animation import (
+    checkpoint_of,
+    load_checkpoint,
+    output_places,
+    read_speech,
+    speech_encoder,
+    write_sample,
+)
 from personalize.errors import UserError
 from personalize.files import sha256_file
 from personalize.regions import kept_share
@@ -68,8 +75,9 @@ def edit_motion(
         out or Path(f"{path.stem}.edit"), settings.samples, [path, settings.source, speech]
     )
     heard = speech is not None and not settings.unconditional
+    checkpoint_path = checkpoint_of(subject)
     encoder = speech_encoder(settings.encoder) if heard else None
-    checkpoint_path, checkpoint = load_subject(subject, encoder)
+    checkpoint = load_checkpoint(checkpoint_path, encoder)
     motion = _load_motion(path)
     try:
         check_motion(checkpoint, motion)
@@ -171,7 +179,10 @@ def _sound_of(
     if not offset_s and motion.provenance.get("av_offset_s"):
         report.say(f"{speech}: not the sound on which the motion's offset was found, which is not applied")
     length_s = len(times) / motion.fps
-    features = None if encoder is None else speech_features(speech, times, encoder)
+    try:
+        features = None if encoder is None else speech_features(speech, times, encoder)
+    except ModelError as error:
+        raise UserError(f"{speech}: {error}") from error
     return on_video_clock(sound, start_s - times[0], length_s, FILM_RATE), features
 
 

@@ -114,13 +114,12 @@ class TrainingFiles(Vocaset):
             if min(rows) < 0 or frames[-1] > 2 * len(rows):
                 raise IndexError("rows below 0, or most frames missing")
             vertices = np.asarray(self._vertices[rows], np.float32).reshape(len(rows), -1)
-            if not np.isfinite(vertices).all():
-                raise ValueError("vertices that are not finite")
         except (LookupError, TypeError, ValueError) as error:
             raise UserError(
                 f"{self.folder / 'subj_seq_to_idx.pkl'}: the rows of {subject}, sentence {sentence}, do not fit"
                 f" data_verts.npy ({' '.join(str(error).split())}); get both files from the same place"
             ) from error
+        _check_finite(vertices, self.folder / "data_verts.npy")
         # Counted in captured frames, so that every second one is taken as it is.
         at = np.arange(0, frames[-1] + 1, STRIDE, dtype=np.float64)
         vertices = resample(vertices, frames.astype(np.float64), at)
@@ -163,11 +162,8 @@ class SequenceFiles(Vocaset):
         """See Vocaset."""
         vertices = _mapped(self._files[subject][sentence], (None, 3 * self.vertex_count))
         taken = np.asarray(vertices[::STRIDE], np.float32)
-        if not np.isfinite(taken).all():
-            raise UserError(
-                f"{self._files[subject][sentence]}: holds vertices that are not finite; get it again"
-            )
-        return taken.reshape(len(taken), -1, 3) - self.templates[subject]
+        _check_finite(taken, self._files[subject][sentence])
+        return taken.reshape(len(taken), self.vertex_count, 3) - self.templates[subject]
 
     def audio(self, subject: str, sentence: int) -> F32:
         """See Vocaset."""
@@ -178,6 +174,11 @@ class SequenceFiles(Vocaset):
 
     def _sound(self, vertices: Path) -> Path:
         return self.folder / "wav" / f"{vertices.stem}.wav"
+
+
+def _check_finite(vertices: F32, path: Path) -> None:
+    if not vertices.size or not np.isfinite(vertices).all():
+        raise UserError(f"{path}: holds no vertices, or some that are not finite; get it again")
 
 
 def open_vocaset(folder: Path) -> Vocaset:

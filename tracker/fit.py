@@ -86,7 +86,7 @@ def trusted(evidence: F32 | None, good: Frames) -> Frames:
     """Rows of the frames `good` [n] that tell something on their own, see `fit_track`; of the best if few do."""
     share = _share(evidence, good)
     few = np.sort(share)[-min(FEW, len(share))]
-    return np.flatnonzero(share >= min(0.5, max(few, share.max() / 2)))
+    return np.flatnonzero(share >= min(0.5, max(few, min(0.25, share.max() / 2))))
 
 
 def _measurable(landmarks: Landmarks, model: LandmarkModel, usable: NDArray[np.bool_]) -> Frames:

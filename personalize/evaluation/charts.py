@@ -39,10 +39,10 @@ def timeline(time: NDArray[np.floating], confidence: NDArray[np.floating], valid
     """Confidence over the clip; frames left out are shaded."""
     figure, axes = _axes(height=1.8)
     axes.plot(time, np.where(valid, confidence, np.nan), color=BLUE, lw=0.8)
-    edges = np.append(time, time[-1] + (np.median(np.diff(time)) if len(time) > 1 else 0.0))
+    edges = np.append(time, time[-1] + (np.median(np.diff(time)) if len(time) > 1 else 1.0))
     first, end = edges[np.flatnonzero(np.diff(~valid, prepend=False, append=False))].reshape(-1, 2).T
-    axes.broken_barh(list(zip(first, end - first)), (0, 1), color=RED, alpha=0.25, lw=0, label="left out")
-    axes.set(ylim=(0, 1.02), xlim=(time[0], time[-1]), xlabel="s", ylabel="confidence")
+    axes.broken_barh(list(zip(first, end - first)), (0, 1), color=RED, alpha=0.25, lw=0.8, label="left out")
+    axes.set(ylim=(0, 1.02), xlim=(edges[0], edges[-1]), xlabel="s", ylabel="confidence")
     if not valid.all():
         axes.legend(loc="lower right", frameon=False)
     return _svg(figure)

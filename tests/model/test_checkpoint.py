@@ -154,10 +154,11 @@ def test_parts_that_do_not_fit(path: Path, changes: dict) -> None:
 
 
 def test_sizes_that_no_memory_holds_are_refused_before_it_is_taken(path: Path) -> None:
-    sizes = json.loads(read_tensors(path)[1]["network"]) | {"channels": 1 << 20}
-    rewritten(path, metadata={"network": json.dumps(sizes)})
-    with pytest.raises(ModelError, match="damaged or incomplete"):
-        Checkpoint.load(path)
+    network = json.loads(read_tensors(path)[1]["network"])
+    for channels in (1 << 20, 0):
+        rewritten(path, metadata={"network": json.dumps(network | {"channels": channels})})
+        with pytest.raises(ModelError, match="damaged or incomplete"):
+            Checkpoint.load(path)
 
 
 def test_a_mesh_that_is_not_the_one_it_names(path: Path) -> None:

@@ -17,7 +17,7 @@ from model.metrics import score
 from model.objective import Draws, GraphedGradient, Objective, SharedGradient, coefficient_weights
 from model.synthesis import synthesize
 from model.trainer import LOG_FILE, STATE_FILE, Trainer, TrainingDivergedError
-from model.training_config import TrainingConfig, settled
+from model.training_config import TrainingConfig, available_device, settled
 from tests.model import talker
 
 TINY = TrainingConfig(
@@ -98,6 +98,17 @@ def test_it_starts_from_a_checkpoint_file_as_from_memory(tmp_path: Path) -> None
     first = Trainer(checkpoint, sequences, tmp_path / "memory", TINY).train()[-1]
     second = Trainer(Checkpoint.load(tmp_path / "base"), sequences, tmp_path / "file", TINY).train()[-1]
     assert_equal(first, second)
+
+
+def test_a_card_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert available_device("cuda:1").index == 1 and available_device("cuda").type == "cuda"
+    with pytest.raises(ModelError, match="'cuda:2' is not there; use cpu or cuda"):
+        available_device("cuda:2")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ModelError, match=r"'cuda' is not there; use cpu$"):
+        available_device("cuda")
 
 
 def test_a_state_of_another_training_is_refused(tmp_path: Path) -> None:

@@ -313,6 +313,15 @@ def test_nobody_is_joined_to_two_faces_that_are_seen_at_once() -> None:
     assert {id(t) for t in kept} == {id(left_of), id(later)}
 
 
+def test_nobody_is_joined_to_a_person_who_is_seen_beside_him_elsewhere() -> None:
+    """Though he is not seen beside the shot that he looks like."""
+    mine = shot(range(0, 100), (0,)), shot(range(200, 230), (0,), jaw=0.01)
+    beside = shot(range(200, 230), (0,), jaw=0.2)
+    assert differences([*mine, beside]).max() < OTHER_PERSON
+    kept, left = main_person([*mine, beside])
+    assert {id(t) for t in kept} == {id(t) for t in mine} and left == [beside]
+
+
 def test_of_two_faces_alike_that_are_seen_together_one_is_the_person() -> None:
     """As in a mirror, or a picture on the wall."""
     mine = [tracklet(1, range(0, 50)), tracklet(1, range(60, 100), seed=1)]

@@ -1,5 +1,7 @@
 """What the report says."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -26,7 +28,15 @@ def test_a_small_offset_of_the_sound_is_told_from_an_unsure_one(
 
 def test_single_frames_that_are_left_out_are_shaded(monkeypatch: pytest.MonkeyPatch) -> None:
     shaded: list[tuple[float, float]] = []
-    monkeypatch.setattr(Axes, "broken_barh", lambda self, spans, *_, **__: shaded.extend(spans))
-    used = np.array([False, True, True, False, True, True, False, False])
-    charts.timeline(np.arange(8) / 25, np.ones(8), used)
+    limits: list[float] = []
+    bars = Axes.broken_barh
+
+    def shade(axes: Axes, spans: list[tuple[float, float]], *where: Any, **look: Any) -> None:
+        shaded.extend(spans)
+        bars(axes, spans, *where, **look)
+
+    monkeypatch.setattr(Axes, "broken_barh", shade)
+    monkeypatch.setattr(charts, "_svg", lambda figure: limits.extend(figure.axes[0].get_xlim()) or "")
+    charts.timeline(np.arange(8) / 25, np.ones(8), np.array([0, 1, 1, 0, 1, 1, 0, 0], bool))
     np.testing.assert_allclose(shaded, [(0, 0.04), (0.12, 0.04), (0.24, 0.08)], atol=1e-9)
+    assert limits == pytest.approx([0, 0.32])

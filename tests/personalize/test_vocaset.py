@@ -128,9 +128,12 @@ def test_vertices_of_a_sentences_file_that_are_not_finite_are_named(tmp_path: Pa
     file = folder / "vertices_npy" / f"{TRAIN[0]}_sentence01.npy"
     vertices = np.load(file)
     vertices[4, 5] = np.inf
-    np.save(file, vertices)
-    with pytest.raises(UserError, match=r"sentence01\.npy: holds vertices that are not finite"):
-        open_vocaset(folder).displacements(TRAIN[0], 1)
+    for wrong in (vertices, vertices[:0]):
+        np.save(file, wrong)
+        with pytest.raises(
+            UserError, match=r"sentence01\.npy: holds no vertices, or some that are not finite"
+        ):
+            open_vocaset(folder).displacements(TRAIN[0], 1)
 
 
 def overwritten(folder: Path, name: str, value: Any) -> Path:
@@ -150,7 +153,7 @@ def overwritten(folder: Path, name: str, value: Any) -> Path:
         ("templates.pkl", {"a": np.zeros((5, 3)), "b": np.zeros((6, 3))}, "different numbers"),
         ("data_verts.npy", np.zeros((10, 7, 3)), "fit templates.pkl"),
         ("data_verts.npy", np.zeros((10, 182, 3), int), "floats"),
-        ("data_verts.npy", np.full((10, 182, 3), np.nan, np.float32), "finite"),
+        ("data_verts.npy", np.full((10, 182, 3), np.nan, np.float32), r"data_verts\.npy: holds no"),
         ("subj_seq_to_idx.pkl", {TRAIN[0]: [1]}, "subject: {sequence"),
         ("subj_seq_to_idx.pkl", {TRAIN[0]: {"sentence01": {0: 10_000}}}, "do not fit"),
         ("subj_seq_to_idx.pkl", {TRAIN[0]: {"sentence01": {0: -1}}}, "do not fit"),

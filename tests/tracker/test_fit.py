@@ -376,6 +376,7 @@ def test_smoothness_does_not_cross_a_cut():
         ([0.9] * 30 + [0.4] * 70, range(30)),
         ([0.55] * 2 + [0.45] * 30 + [0.1] * 68, range(32)),  # hardly any is sure
         ([0.45] * 50 + [0.3] * 50, range(50)),
+        ([1.0] + [0.45] * 99, range(100)),
     ],
 )
 def test_frames_that_are_bare_are_trusted_or_the_barest(evidence: list[float], rows: range):
