@@ -185,9 +185,8 @@ def display_matrix(frame: Any) -> NDArray[np.int64]:
 
     Mirrors are lost where something unknown lies beside the picture too.
     """
-    try:
-        beside = list(frame.side_data)
-    except ValueError:  # FFmpeg knows a kind that PyAV does not, as EXIF
+    beside = _beside(frame)
+    if beside is None:
         quarters = round(frame.rotation / 90) % 4
         return np.asarray(np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarters), np.int64)
     for side in beside:
@@ -197,6 +196,14 @@ def display_matrix(frame: Any) -> NDArray[np.int64]:
             if abs(round(float(np.linalg.det(matrix)))) == 1 and np.abs(matrix).sum() == 2:
                 return matrix
     return np.eye(2, dtype=np.int64)
+
+
+def _beside(frame: Any) -> list[Any] | None:
+    """What is stored beside a picture; None where FFmpeg knows a kind of it that PyAV does not, as EXIF."""
+    try:
+        return list(frame.side_data)
+    except ValueError:
+        return None
 
 
 def quantizer(path: Path) -> float:
@@ -214,11 +221,7 @@ def quantizer(path: Path) -> float:
 
 def _quantizer(frame: Any) -> float | None:
     """Of a picture of H.264, the mean of its blocks; None if it does not tell."""
-    try:
-        beside = list(frame.side_data)
-    except ValueError:  # as for `display_matrix`
-        return None
-    for side in beside:
+    for side in _beside(frame) or []:
         if side.type == SideData.VIDEO_ENC_PARAMS:
             data = memoryview(side)
             blocks = np.frombuffer(data, _CODED_BLOCKS, count=1)[0]

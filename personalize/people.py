@@ -289,18 +289,13 @@ def differences(faces: Sequence[Tracklet]) -> F64:
     shapes, pictures = zip(*(look for of_face in looks for look in of_face))
     scores = landmark_bias().features(np.stack(shapes))[0][:, TURN:]
     portraits = np.stack([picture.ravel() for picture in pictures]).astype(np.float64)
-    portraits = _of_norm_1(portraits - portraits.mean(axis=1, keepdims=True))
     apart = np.zeros((len(faces), len(faces)))
     for row, (start, end) in enumerate(pairwise(first)):
-        # Of vectors of norm 1 half of the squared distance is what their product lacks of 1.
-        uncorrelated = cdist(portraits[start:end], portraits, "sqeuclidean") / 2
+        # A flat picture is like no other.
+        uncorrelated = np.nan_to_num(cdist(portraits[start:end], portraits, "correlation"), nan=1.0)
         distance = cdist(scores[start:end], scores) / SHAPE_SCALE + uncorrelated / PORTRAIT_SCALE
         apart[row] = np.minimum.reduceat(distance.min(axis=0), first[:-1])
     return apart
-
-
-def _of_norm_1(rows: F64) -> F64:
-    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
 
 
 def main_person(tracklets: list[Tracklet]) -> tuple[list[Tracklet], list[Tracklet]]:
@@ -319,7 +314,8 @@ def main_person(tracklets: list[Tracklet]) -> tuple[list[Tracklet], list[Trackle
 def _persons(faces: list[Tracklet]) -> list[NDArray[np.int64]]:
     """Rows of faces that look like each other, person by person; nobody is in two places at once.
 
-    The most alike are joined first (single linkage): in two seconds a face shows but part of how it looks.
+    The most alike are joined first: in two seconds a face shows but part of how it looks. (Single linkage, but scipy's
+    knows of nobody who must stay apart.)
     """
     number = np.arange(len(faces))
     if len(faces) > 1:

@@ -140,11 +140,8 @@ def _sound_offset(registration: dict[str, Any]) -> str:
         done = "corrected"
     else:
         done = f"{'small' if 0 < abs(found_s) <= SMALLEST_S else 'not sure'}, left as it is"  # 0: nothing was found
-    return (
-        f"{abs(found_s) * 1000:.0f} ms {'late' if found_s > 0 else 'early'} ({done})"
-        if found_s
-        else f"0 ms ({done})"
-    )
+    side = " late" if found_s > 0 else " early" if found_s < 0 else ""
+    return f"{abs(found_s) * 1000:.0f} ms{side} ({done})"
 
 
 def _data_url(path: Path, kind: str) -> str:

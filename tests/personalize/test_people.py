@@ -282,6 +282,12 @@ def test_people_are_told_apart_by_the_shape_of_the_face_and_by_how_the_head_look
     apart_from_one = differences([one, paler, shape, hair, both])[0]
     assert apart_from_one[:2].max() < 0.1 and min(apart_from_one[2:4]) > OTHER_PERSON / 2
     assert apart_from_one[4] == pytest.approx(sum(apart_from_one[2:4]), abs=0.1)
+    flat = shot(range(200, 230), (0,))
+    flat.sightings = [
+        (seen.sample and replace(seen, sample=(seen.sample[0], np.zeros((14, 12), np.uint8)))) or seen
+        for seen in flat.sightings
+    ]
+    assert differences([one, flat])[0, 1] > OTHER_PERSON
 
 
 def test_shots_of_one_person_are_compared_where_they_are_most_alike() -> None:
